@@ -1,0 +1,1 @@
+"""What the scope sees and where it is: edges of the instrument gap and the pose of the lens."""

@@ -1,0 +1,1 @@
+"""Everything that reads or writes bags: play, record, process, check."""

@@ -1,0 +1,1 @@
+"""How wide the instrument gap is, and how sure that is."""
