@@ -1,0 +1,63 @@
+"""Two points of the anatomy, one just inside each edge of the gap, as one image shows them."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+
+class EdgeStatus(IntEnum):
+    """Whether the points may be used; the constants of knee_gap_msgs/GapEdges."""
+
+    UNKNOWN = 0
+    VALID = 1
+    NO_GAP = 2
+    LOW_CONTRAST = 3
+    OUT_OF_VIEW = 4
+
+
+class EdgeKind(IntEnum):
+    """What kind of edge a point lies beside; the constants of knee_gap_msgs/GapEdges."""
+
+    UNKNOWN = 0
+    RIM = 1
+    CONTOUR = 2
+    SHADING = 3
+
+
+@dataclass(frozen=True)
+class GapEdges:
+    """The two points G0 and G1 in one image; the fields of knee_gap_msgs/GapEdges.
+
+    `stamp_ns` is the exposure time [ns]; `frame_id` the optical frame of the lens. `track_id` is 0 without a
+    track; the same id means the same two points. `bearings` (2, 3) are unit vectors, `pixels` (2, 2) columns
+    and rows, `covariances` (2, 3, 3) those of the unit vectors [rad^2], and `angular_error` bounds the angle
+    between each bearing and its true direction [rad]. Unknown numbers are NaN.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    status: EdgeStatus
+    track_id: int
+    bearings: npt.NDArray[np.float64]
+    pixels: npt.NDArray[np.float64]
+    kinds: tuple[EdgeKind, EdgeKind]
+    covariances: npt.NDArray[np.float64]
+    angular_error: float
+
+    @classmethod
+    def without_points(cls, stamp_ns: int, frame_id: str, status: EdgeStatus, track_id: int = 0) -> Self:
+        """Edges of an image in which the points are not known."""
+        return cls(
+            stamp_ns=stamp_ns,
+            frame_id=frame_id,
+            status=status,
+            track_id=track_id,
+            bearings=np.full((2, 3), np.nan),
+            pixels=np.full((2, 2), np.nan),
+            kinds=(EdgeKind.UNKNOWN, EdgeKind.UNKNOWN),
+            covariances=np.full((2, 3, 3), np.nan),
+            angular_error=float("nan"),
+        )

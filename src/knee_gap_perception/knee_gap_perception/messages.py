@@ -1,0 +1,123 @@
+"""Messages to images and edges to messages, by field name: ROS's own classes and any other serve alike."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_perception.edges import GapEdges
+from knee_gap_perception.errors import PerceptionError
+
+Image = npt.NDArray[np.uint8]
+
+# Channels of each accepted encoding and what makes it blue, green, red.
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "bgr8": (3, None),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "mono8": (1, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, cv2.COLOR_GRAY2BGR),
+    "8UC3": (3, None),
+}
+
+
+def stamp_ns(header: Any) -> int:
+    """Stamp of a std_msgs/Header [ns]."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def _refuse_encoding(encoding: str) -> None:
+    """Raise PerceptionError unless the encoding is one that is read."""
+    if encoding in ENCODINGS:
+        return
+    choices = ", ".join(ENCODINGS)
+    if encoding.startswith("bayer"):
+        raise PerceptionError(f"a Bayer image ('{encoding}') must be debayered first, to one of {choices}")
+    if "16" in encoding or "32" in encoding or "64" in encoding:
+        raise PerceptionError(
+            f"an image must have 8 bits a channel, not '{encoding}'; encodings read: {choices}"
+        )
+    raise PerceptionError(f"the image encoding must be one of {choices}, not '{encoding}'")
+
+
+def image_from_message(message: Any) -> Image:
+    """Image (height, width, 3), blue green red, of a sensor_msgs/Image.
+
+    Raises PerceptionError for encodings that are not read, empty images, and data that do not fill the image.
+    """
+    encoding = str(message.encoding)
+    _refuse_encoding(encoding)
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    channels, conversion = ENCODINGS[encoding]
+    if height < 1 or width < 1:
+        raise PerceptionError(f"an image must have at least 1x1 px, not {width}x{height} px")
+    if step < width * channels:
+        raise PerceptionError(
+            f"{width} px in {encoding} take {width * channels} bytes a row, but the image's step is {step}"
+        )
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if data.size < height * step:
+        raise PerceptionError(
+            f"{height} rows of {step} bytes need {height * step} bytes, the image has {data.size}"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * channels]
+    pixels = rows.reshape(height, width, channels)
+    if conversion is None:
+        return np.ascontiguousarray(pixels)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+
+
+def image_from_compressed(message: Any) -> Image:
+    """Image (height, width, 3), blue green red, of a sensor_msgs/CompressedImage (JPEG, PNG, ...).
+
+    Raises PerceptionError for data that are no image, more than 8 bits a channel, depth and Bayer images.
+    """
+    description = str(message.format)
+    encoding = description.split(";")[0].strip()
+    if encoding.startswith("bayer"):
+        _refuse_encoding(encoding)
+    if "compressedDepth" in description:
+        raise PerceptionError(f"a depth image ('{description}') is not a picture of the scope")
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if data.size == 0:
+        raise PerceptionError("the compressed image is empty: 0 bytes")
+    is_jpeg = data[:2].tobytes() == b"\xff\xd8"
+    # A JPEG has 8 bits; anything else is read unchanged first, so that 16 bits are refused rather than cut.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if is_jpeg else cv2.IMREAD_UNCHANGED
+    try:
+        image = cv2.imdecode(data, flags)
+    except cv2.error as error:
+        raise PerceptionError(
+            f"the compressed image ('{description}') cannot be decoded: {error.err}"
+        ) from error
+    if image is None:
+        raise PerceptionError(f"the compressed image ('{description}', {data.size} bytes) cannot be decoded")
+    if image.dtype != np.uint8:
+        raise PerceptionError(f"an image must have 8 bits a channel, not {image.dtype}")
+    if image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    elif image.shape[2] == 4:
+        image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
+    return np.asarray(image, dtype=np.uint8)
+
+
+def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/GapEdges from edges; returns the message."""
+    seconds, nanoseconds = divmod(edges.stamp_ns, 1_000_000_000)
+    message.header.stamp.sec = seconds
+    message.header.stamp.nanosec = nanoseconds
+    message.header.frame_id = edges.frame_id
+    message.status = int(edges.status)
+    message.track_id = int(edges.track_id)
+    for index in (0, 1):
+        bearing = getattr(message, f"bearing_{index}")
+        bearing.x, bearing.y, bearing.z = (float(value) for value in edges.bearings[index])
+        setattr(message, f"pixel_{index}", np.array(edges.pixels[index], dtype=np.float64))
+        setattr(message, f"kind_{index}", int(edges.kinds[index]))
+        setattr(
+            message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
+        )
+    message.angular_error = float(edges.angular_error)
+    return message
