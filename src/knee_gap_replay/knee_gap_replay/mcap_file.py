@@ -1,0 +1,228 @@
+"""One MCAP file, whole, cut or damaged: its blocks of messages, in order of time.
+
+The file is walked record by record, headers only, and its index is used to find the way again where the walk
+breaks off. What cannot be read is named once, in one line, and everything else is given.
+"""
+
+import heapq
+import logging
+import os
+import struct
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import MAGIC_SIZE, breakup_chunk
+from mcap.summary import Summary
+
+from knee_gap_replay.errors import BagError
+
+_LOG = logging.getLogger(__name__)
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD_HEAD = struct.Struct("<BQ")
+_TIMES = struct.Struct("<QQ")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_INDEX_ENTRY_SIZE = 16
+_INDEX_HEAD_SIZE = 6
+
+
+class Block(NamedTuple):
+    """A record that holds messages: a chunk, or a single message of a file without chunks."""
+
+    start_ns: int
+    offset: int
+    length: int
+    is_chunk: bool
+    message_count: int
+
+
+class Entry(NamedTuple):
+    """One message as the file has it."""
+
+    time_ns: int
+    topic: str
+    schema_name: str
+    data: bytes
+
+
+class McapFile:
+    """The readable part of one MCAP file.
+
+    `losses` has one line for each part that is not readable; it grows while blocks are read. Raises BagError
+    where the file is no MCAP file at all or cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.losses: list[str] = []
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.blocks: list[Block] = []
+        try:
+            self._size = path.stat().st_size
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise BagError(f"{path}: {error.strerror}") from None
+        try:
+            self._open()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def read(self, block: Block) -> list[Entry]:
+        """Return the messages of a block, in the order of the file; none, and a loss, where it is damaged."""
+        try:
+            records = self._records(block)
+        except Exception as error:  # every decompressor and parser fails in its own way on damaged bytes
+            reason = str(error) or type(error).__name__
+            self._lose(f"{block.message_count or 'all'} messages at byte {block.offset} lost: {reason}")
+            return []
+        self._note_definitions(records)
+        return [self._entry(record) for record in records if isinstance(record, Message)]
+
+    def _entry(self, message: Message) -> Entry:
+        channel = self.channels[message.channel_id]
+        schema = self.schemas.get(channel.schema_id)
+        return Entry(message.log_time, channel.topic, schema.name if schema else "", message.data)
+
+    def _open(self) -> None:
+        if self._size == 0:
+            raise BagError(f"{self.path} is empty")
+        head = self._file.read(MAGIC_SIZE + 1)
+        if head[:MAGIC_SIZE] != _MAGIC:
+            if head[MAGIC_SIZE:] != bytes([Opcode.HEADER]):
+                raise BagError(f"{self.path} is not an MCAP file")
+            self._lose("the first bytes of the file are damaged")
+        summary = self._summary()
+        indexed = {index.chunk_start_offset: index for index in summary.chunk_indexes} if summary else {}
+        self._walk(sorted(indexed), summary is not None)
+        known = {block.offset for block in self.blocks}
+        for offset in sorted(set(indexed) - known):
+            self._lose(f"the messages at byte {offset} lost: no chunk where the index says one is")
+        if summary is not None:
+            self.schemas.update(summary.schemas)
+            self.channels.update(summary.channels)
+        else:
+            for block in self.blocks:
+                if block.is_chunk:
+                    self._peek_definitions(block)
+        self.blocks.sort()
+
+    def _summary(self) -> Summary | None:
+        """Return the index at the end of the file, None where it is absent or damaged."""
+        try:
+            self._file.seek(0)
+            summary = make_reader(self._file).get_summary()
+        except Exception:  # a cut or damaged end fails in many ways; the walk tells what is lost
+            return None
+        return summary if summary is not None and summary.channels else None
+
+    def _walk(self, indexed: list[int], has_index: bool) -> None:
+        """Collect the blocks from the heads of the records, resuming at the next indexed chunk if need be."""
+        offset = MAGIC_SIZE
+        while offset < self._size:
+            self._file.seek(offset)
+            head = self._file.read(_RECORD_HEAD.size)
+            if len(head) < _RECORD_HEAD.size:
+                self._lose(f"cut at byte {offset}: the last {self._size - offset} bytes lost")
+                return
+            opcode, length = _RECORD_HEAD.unpack(head)
+            end = offset + _RECORD_HEAD.size + length
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                if not has_index and self.blocks:
+                    self._lose("the index at the end is damaged; read without it")
+                return
+            if end > self._size or opcode == 0:
+                resumed = next((start for start in indexed if start > offset), None)
+                until = self._size if resumed is None else resumed
+                self._lose(f"cut or damaged at byte {offset}: {until - offset} bytes lost")
+                if resumed is None:
+                    return
+                offset = resumed
+                continue
+            self._note(opcode, offset, length)
+            offset = end
+        self._lose("no end mark: the recording was cut short")
+
+    def _note(self, opcode: int, offset: int, length: int) -> None:
+        if opcode == Opcode.CHUNK:
+            start_ns, _ = _TIMES.unpack(self._file.read(_TIMES.size))
+            self.blocks.append(Block(start_ns, offset, length, True, 0))
+        elif opcode == Opcode.MESSAGE:
+            _, _, time_ns, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
+            self.blocks.append(Block(time_ns, offset, length, False, 1))
+        elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
+            entries = max(0, length - _INDEX_HEAD_SIZE) // _INDEX_ENTRY_SIZE
+            self.blocks[-1] = self.blocks[-1]._replace(message_count=self.blocks[-1].message_count + entries)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            stream = ReadDataStream(self._file)
+            try:
+                if opcode == Opcode.METADATA:
+                    record = Metadata.read(stream)
+                    self.metadata[record.name] = dict(record.metadata)
+                else:
+                    self._note_definitions([(Schema if opcode == Opcode.SCHEMA else Channel).read(stream)])
+            except Exception:  # damaged strings and lengths fail in many ways
+                self._lose(f"the {Opcode(opcode).name.lower()} at byte {offset} is damaged")
+
+    def _records(self, block: Block) -> list[McapRecord]:
+        self._file.seek(block.offset + _RECORD_HEAD.size)
+        stream = ReadDataStream(self._file)
+        if not block.is_chunk:
+            return [Message.read(stream, block.length)]
+        chunk = Chunk.read(stream)
+        return breakup_chunk(chunk, validate_crc=True)
+
+    def _peek_definitions(self, block: Block) -> None:
+        try:
+            self._note_definitions(self._records(block))
+        except Exception:  # told when the block is read
+            return
+
+    def _note_definitions(self, records: Iterable[McapRecord]) -> None:
+        for record in records:
+            if isinstance(record, Schema):
+                self.schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                self.channels.setdefault(record.id, record)
+
+    def _lose(self, what: str) -> None:
+        line = f"{self.path.name}: {what}"
+        self.losses.append(line)
+        _LOG.warning(line)
+
+
+def in_time_order(files: Iterable[McapFile], topics: Collection[str] | None) -> Iterator[Entry]:
+    """Yield the messages of all files, by time, then file, then place; holds only blocks that overlap."""
+    by_number: Mapping[int, McapFile] = dict(enumerate(files))
+    blocks = sorted(
+        (block.start_ns, number, block) for number, file in by_number.items() for block in file.blocks
+    )
+    waiting: list[tuple[int, int, int, int, Entry]] = []
+    for start_ns, number, block in blocks:
+        while waiting and waiting[0][0] < start_ns:
+            yield heapq.heappop(waiting)[-1]
+        for place, entry in enumerate(by_number[number].read(block)):
+            if topics is None or entry.topic in topics:
+                heapq.heappush(waiting, (entry.time_ns, number, block.offset, place, entry))
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
+
+
+def mcap_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a folder, in the order of their numbers."""
+
+    def key(path: Path) -> tuple[str, int]:
+        stem, _, number = path.stem.rpartition("_")
+        return (stem, int(number)) if number.isdigit() else (path.stem, -1)
+
+    return sorted((folder / name for name in os.listdir(folder) if name.endswith(".mcap")), key=key)
