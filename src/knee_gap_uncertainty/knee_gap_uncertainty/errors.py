@@ -1,0 +1,25 @@
+"""Why a measurement is refused: one small family, each message with the rule and the value that broke it."""
+
+
+class MeasurementError(ValueError):
+    """No honest number can be given for these views."""
+
+
+class BadInputError(MeasurementError):
+    """A value that cannot be: not finite, not a unit vector, negative, of the wrong shape, not a choice."""
+
+
+class TravelTooShortError(MeasurementError):
+    """The lens positions are closer than their errors: even the direction of travel is unknown."""
+
+
+class ParallelToTravelError(MeasurementError):
+    """A bearing lies along the travel, within the admitted error: it spans no triangle with it."""
+
+
+class RaysMeetBehindError(MeasurementError):
+    """The two rays to a point do not meet in front of both lenses."""
+
+
+class UnboundedError(MeasurementError):
+    """The two rays to a point are parallel: it is at infinity, and no gap can be told."""
