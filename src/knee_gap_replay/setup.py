@@ -17,7 +17,6 @@ setup(
     ],
     zip_safe=False,
     entry_points={
-        "console_scripts": [
-        ],
+        "console_scripts": [],
     },
 )

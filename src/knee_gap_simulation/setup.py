@@ -18,6 +18,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
+            "make_bag = knee_gap_simulation.make_bag:main",
         ],
     },
 )

@@ -1,0 +1,27 @@
+# knee_gap: two commands, `make demo` and `make test`; both set up whatever is missing.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench clean
+
+help: ## show what there is
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
+
+setup: ## set up whatever is missing
+	@tools/setup
+
+demo: setup ## play the sample bag through the live nodes; results in out/demo
+	@tools/run knee_gap_bringup demo
+
+test: setup ## run all tests
+	@tools/env python -m pytest
+
+lint: setup ## ruff, mypy
+	@tools/env ruff check .
+	@tools/env ruff format --check .
+	@tools/env mypy
+
+bench: setup ## measure speed and memory, as ratios against named floors and rivals
+	@tools/env python bench/bench.py
+
+clean: ## remove everything that was set up, built or written
+	rm -rf .venv build install log out

@@ -1,0 +1,60 @@
+"""leg_controller_node: an example subscriber of gap that moves nothing unless the gap is known."""
+
+from collections.abc import Mapping, Sequence
+
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+
+from knee_gap_bringup.leg_control import Action, Command, LegParameters, decide
+from knee_gap_msgs.msg import GapEstimate
+from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
+
+
+class LegControllerNode(BaseNode):
+    """Converts, decides, publishes the rate at which the joint should open [m/s]."""
+
+    def __init__(self) -> None:
+        super().__init__("leg_controller_node", health=self.health)
+        self._parameters = self.declare(LegParameters)
+        self.refuse_unknown_parameters()
+        self._command = Command(Action.HOLD, 0.0, "no estimate received yet")
+        self._rate = self.create_publisher(Float64, "leg/opening_rate", RESULT_QOS)
+        qos = QoSProfile(
+            depth=1,
+            reliability=RESULT_QOS.reliability,
+            deadline=Duration(nanoseconds=int(self._parameters.deadline * 1e9)),
+        )
+        self.create_subscription(
+            GapEstimate,
+            "gap",
+            self.on_gap,
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(deadline=self.on_silence),
+        )
+
+    def on_gap(self, message: GapEstimate) -> None:
+        """Decide on one estimate."""
+        valid = message.status == GapEstimate.STATUS_VALID
+        self.command(decide(valid, message.gap_min, message.gap_max, self._parameters))
+
+    def on_silence(self, _event: object) -> None:
+        """Hold the leg: whoever measures the gap is late or dead."""
+        self.command(Command(Action.HOLD, 0.0, "no estimate within the deadline"))
+
+    def command(self, command: Command) -> None:
+        """Publish a command, and say so when the action changes."""
+        if command.action is not self._command.action:
+            self.get_logger().info(f"{command.action}: {command.reason}")
+        self._command = command
+        self._rate.publish(Float64(data=command.opening_rate))
+
+    def health(self) -> tuple[bool, str, Mapping[str, object]]:
+        """The present action and its reason."""
+        return True, f"{self._command.action}: {self._command.reason}", {}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(LegControllerNode, argv)

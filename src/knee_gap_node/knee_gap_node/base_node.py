@@ -1,0 +1,98 @@
+"""The base of every node: parameters, QoS by purpose, diagnostics, and one way to start and to stop."""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.parameters import as_rows, declare, refuse_unknown
+
+Parameters = TypeVar("Parameters")
+
+# Images: whatever the camera offers, and never a queue of old ones. Four hold 67 ms at 60 Hz, which is what a
+# busy two-core machine needs to lose nothing.
+IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=4, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Trackers publish best effort or reliable; a best-effort subscription hears both. 64 poses: 0.5 s at 120 Hz.
+TRACKER_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=64, reliability=ReliabilityPolicy.BEST_EFFORT)
+# What the suite says to itself and to a controller must arrive.
+RESULT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=64, reliability=ReliabilityPolicy.RELIABLE)
+# A subscriber that comes late still gets the last one.
+LATCHED_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+# What a node says of itself once a second: is all well, in a few words, and the counts behind it.
+Health = tuple[bool, str, Mapping[str, object]]
+
+
+class BaseNode(Node):  # type: ignore[misc]  # rclpy is untyped
+    """A node whose parameters come from a dataclass and that says once a second how it fares."""
+
+    def __init__(self, name: str, *, health: Callable[[], Health]) -> None:
+        super().__init__(name)
+        self._health = health
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RESULT_QOS)
+        self._diagnostics_timer = self.create_timer(1.0, self.publish_diagnostics)
+        self._reasons_logged: set[str] = set()
+
+    def declare(self, kind: type[Parameters]) -> Parameters:
+        """Declare the fields of the dataclass `kind` as read-only parameters; return their values."""
+        return declare(self, kind)
+
+    def refuse_unknown_parameters(self) -> None:
+        """Refuse to start with a parameter that no component declared."""
+        refuse_unknown(self, self._parameter_overrides)
+
+    def publish_diagnostics(self) -> None:
+        """Publish the node's health now."""
+        well, words, counts = self._health()
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.OK if well else DiagnosticStatus.WARN,
+            name=self.get_fully_qualified_name(),
+            message=words,
+            values=[KeyValue(key=key, value=value) for key, value in as_rows(counts)],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def log_once(self, reason: str, words: str) -> None:
+        """Log `words` the first time that `reason` comes; later ones are counted in the diagnostics only."""
+        if reason not in self._reasons_logged:
+            self._reasons_logged.add(reason)
+            self.get_logger().warning(words)
+
+
+def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
+    """Start a node, spin until it is told to stop, return the exit code: 2 for a mistake of the user's."""
+    try:
+        rclpy.init(args=None if argv is None else list(argv))
+    except Exception as error:  # rclpy's parser raises several unrelated kinds for a bad --ros-args
+        print(f"cannot start: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    node = None
+    try:
+        node = make_node()
+        # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ConfigurationError as error:
+        print(f"cannot start: {error}", file=sys.stderr)
+        return 2
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,132 @@
+"""The estimator: posed observations of the two edges go in, estimates with bounds come out.
+
+The live node, the offline processing of a bag and the simulation run this same object; only what feeds it
+differs. It waits for nothing and reads no clock: whoever feeds it says when each message arrived, on a
+clock that does not run backwards, and calls `advance` when time passes without one.
+"""
+
+from collections import Counter, deque
+from typing import NamedTuple
+
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_uncertainty.track import Track
+
+NANOSECONDS = 1_000_000_000
+
+# The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
+MOST_PENDING = 128
+
+
+class Pending(NamedTuple):
+    """Edges that wait for the lens pose after them, and when they arrived [ns]."""
+
+    edges: EdgeObservation
+    arrival_ns: int
+
+
+class GapEstimator:
+    """Fuses edges and lens poses into one estimate an image, in the order of the images."""
+
+    def __init__(self, parameters: EstimatorParameters | None = None) -> None:
+        self.parameters = parameters or EstimatorParameters()
+        self.counts: Counter[str] = Counter()
+        self.latest: GapEstimate | None = None
+        self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
+        self._pending: deque[Pending] = deque()
+        self._track: Track | None = None
+        self._frame_id = ""
+        self._last_edges: Pending | None = None
+        self._silence_told_ns = 0
+
+    def add_pose(self, pose: LensPose, arrival_ns: int) -> list[GapEstimate]:
+        """Take a lens pose; return the estimates that it made possible."""
+        refusal = self._poses.add(pose)
+        if refusal is not None:
+            self.counts[f"pose refused: {refusal.value}"] += 1
+        else:
+            self._frame_id = pose.frame_id
+        return self._resolve(arrival_ns)
+
+    def add_edges(self, edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
+        """Take the edges of one image; return the estimates that are ready."""
+        if self._last_edges is not None and edges.stamp_ns <= self._last_edges.edges.stamp_ns:
+            self.counts["stamps ran backwards"] += 1
+            self._pending.clear()
+            self._track = None
+        self._last_edges = Pending(edges, arrival_ns)
+        self._silence_told_ns = arrival_ns
+        if len(self._pending) == MOST_PENDING:
+            self.counts["images dropped while waiting for poses"] += 1
+            self._pending.popleft()
+        self._pending.append(Pending(edges, arrival_ns))
+        return self._resolve(arrival_ns)
+
+    def advance(self, now_ns: int) -> list[GapEstimate]:
+        """Let time pass; return the estimates that must not wait any longer, and what silence means."""
+        estimates = self._resolve(now_ns)
+        if self._last_edges is None or self._pending:
+            return estimates
+        silence_ns = now_ns - self._silence_told_ns
+        if silence_ns > self.parameters.max_edges_silence * NANOSECONDS:
+            self._silence_told_ns = now_ns
+            last = self._last_edges
+            # The only stamp that is not an image's: no image came, and the statement needs a time.
+            stamp_ns = last.edges.stamp_ns + now_ns - last.arrival_ns
+            estimates.append(self._without(stamp_ns, GapStatus.NO_EDGES, 0, "no edges arrive"))
+        return estimates
+
+    def _resolve(self, now_ns: int) -> list[GapEstimate]:
+        """Estimates of every pending image, in order, up to the first that may still wait for its pose."""
+        estimates = []
+        while self._pending:
+            estimate = self._try(self._pending[0], now_ns)
+            if estimate is None:
+                break
+            self._pending.popleft()
+            estimates.append(estimate)
+        return estimates
+
+    def _try(self, pending: Pending, now_ns: int) -> GapEstimate | None:
+        """Estimate of one image, or None while its lens pose may still come."""
+        edges = pending.edges
+        if not edges.usable:
+            reason = f"the image gave no usable edges (edge status {edges.status})"
+            return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, reason)
+        pose = self._poses.at(edges.stamp_ns)
+        if isinstance(pose, LensPose):
+            return self._measure(edges, pose)
+        if pose is PoseRefusal.NOT_YET:
+            if now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS:
+                return None
+            return self._without(
+                edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, "no lens pose follows the image"
+            )
+        return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, pose.value)
+
+    def _measure(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
+        """Estimate from the edges and their lens pose, within the track that they belong to."""
+        if self._track is None or not self._track.continues_with(edges, pose):
+            self._track = Track(edges.track_id, pose.frame_id, self.parameters)
+        return self._count(self._track.add(edges, pose))
+
+    def _without(self, stamp_ns: int, status: GapStatus, track_id: int, reason: str) -> GapEstimate:
+        """An estimate that says why there is no number."""
+        return self._count(
+            GapEstimate(
+                stamp_ns,
+                self._frame_id,
+                status,
+                track_id=track_id,
+                interval=self.parameters.interval,
+                reason=reason,
+            )
+        )
+
+    def _count(self, estimate: GapEstimate) -> GapEstimate:
+        self.latest = estimate
+        self.counts[estimate.status.name] += 1
+        if estimate.reason:
+            self.counts[f"{estimate.status.name}: {estimate.reason}"] += 1
+        return estimate

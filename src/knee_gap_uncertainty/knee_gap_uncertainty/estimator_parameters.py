@@ -1,0 +1,90 @@
+"""Settings of the estimator, each with its meaning and the values it takes."""
+
+from dataclasses import dataclass, field
+
+from knee_gap_uncertainty.errors import MeasurementError
+
+
+@dataclass(frozen=True)
+class EstimatorParameters:
+    """Settings of GapEstimator, validated where they are built; SI units."""
+
+    interval: str = field(
+        default="worst_case",
+        metadata={
+            "description": "error model of gap_min, gap_max and snr: worst_case is the safety interval, "
+            "paper the published one",
+            "choices": ("worst_case", "paper"),
+        },
+    )
+    apex: str = field(
+        default="best",
+        metadata={
+            "description": "view whose rays carry the error clouds; best: the higher signal-to-noise ratio",
+            "choices": ("first", "second", "best"),
+        },
+    )
+    tracker_bound: float = field(
+        default=3.0,
+        metadata={
+            "description": "bound of the tracked errors as a multiple of their RMS [-]; the paper takes 1",
+            "range": (1.0, 10.0),
+        },
+    )
+    confidence_level: float = field(
+        default=0.95,
+        metadata={
+            "description": "share of cases the confidence interval holds the truth in [-]",
+            "range": (0.5, 0.999),
+        },
+    )
+    common_share: float = field(
+        default=0.5,
+        metadata={
+            "description": "share of the bearings' variance that is common to all views of a track [-]",
+            "range": (0.0, 1.0),
+        },
+    )
+    target_snr: float = field(
+        default=4.0,
+        metadata={
+            "description": "signal-to-noise ratio that translation_to_target asks for [-]",
+            "range": (0.1, 1000.0),
+        },
+    )
+    max_pose_age: float = field(
+        default=0.025,
+        metadata={
+            "description": "how far from the image's stamp the lens poses on either side may lie [s]",
+            "range": (0.001, 1.0),
+        },
+    )
+    max_pose_wait: float = field(
+        default=0.02,
+        metadata={
+            "description": "how long an image waits for the lens pose after it before tracking is lost [s]",
+            "range": (0.0, 1.0),
+        },
+    )
+    max_edges_silence: float = field(
+        default=0.05,
+        metadata={
+            "description": "time without edges after which NO_EDGES is said [s]",
+            "range": (0.01, 10.0),
+        },
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what no ROS range can: a combination or a value given in code."""
+        for name in ("tracker_bound", "target_snr", "max_pose_age", "max_edges_silence"):
+            if not getattr(self, name) > 0.0:
+                raise MeasurementError(f"{name} must be above 0, not {getattr(self, name)!r}")
+        if not 0.0 < self.confidence_level < 1.0:
+            raise MeasurementError(f"confidence_level must lie in (0, 1), not {self.confidence_level!r}")
+        if not 0.0 <= self.common_share <= 1.0:
+            raise MeasurementError(f"common_share must lie in [0, 1], not {self.common_share!r}")
+        for name, choices in (("interval", ("worst_case", "paper")), ("apex", ("first", "second", "best"))):
+            if getattr(self, name) not in choices:
+                raise MeasurementError(
+                    f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}"
+                )

@@ -1,0 +1,68 @@
+"""What is published of the gap, and of an observation of its edges: the values that go in and come out."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+NAN = float("nan")
+
+
+class GapStatus(IntEnum):
+    """Whether the numbers may be acted on; the constants of knee_gap_msgs/GapEstimate."""
+
+    UNKNOWN = 0
+    VALID = 1
+    NO_EDGES = 2
+    TRACKING_LOST = 3
+    INSUFFICIENT_PARALLAX = 4
+    OUT_OF_SYNC = 5
+    JOINT_MOVED = 6
+
+
+@dataclass(frozen=True)
+class EdgeObservation:
+    """The two points in one image.
+
+    `stamp_ns` is the exposure time [ns]; `bearings` (2, 3) unit vectors in the lens frame; `covariances`
+    (2, 3, 3) of the unit vectors [rad^2]; `angular_error` bounds each bearing's angle to the truth [rad].
+    `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code.
+    """
+
+    stamp_ns: int
+    track_id: int
+    usable: bool
+    bearings: npt.NDArray[np.float64]
+    covariances: npt.NDArray[np.float64]
+    angular_error: float
+    status: int = 0
+
+
+@dataclass(frozen=True)
+class GapEstimate:
+    """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
+
+    `points` (2, 3) are in the frame `frame_id`. `shares` (4,) divide the variance among image, lens position,
+    lens rotation and common part. `reason` says why the status is not VALID; it is not in the message.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    status: GapStatus
+    track_id: int = 0
+    interval: str = "worst_case"
+    gap: float = NAN
+    gap_min: float = NAN
+    gap_max: float = NAN
+    snr: float = NAN
+    confidence_level: float = NAN
+    confidence_min: float = NAN
+    confidence_max: float = NAN
+    baseline: float = NAN
+    parallax: float = NAN
+    view_count: int = 0
+    translation_to_target: float = NAN
+    points: tuple[tuple[float, float, float], tuple[float, float, float]] = ((NAN,) * 3, (NAN,) * 3)
+    shares: tuple[float, float, float, float] = (NAN,) * 4
+    reason: str = ""

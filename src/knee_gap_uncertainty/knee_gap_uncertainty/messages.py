@@ -1,0 +1,61 @@
+"""Messages to observations and estimates to messages, by field name: any classes with those fields serve."""
+
+from typing import Any
+
+import numpy as np
+
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_uncertainty.pose_buffer import LensPose
+
+VALID_EDGES = 1
+INTERVALS = {"worst_case": 0, "paper": 1}
+SHARES = ("share_image", "share_lens_position", "share_lens_rotation", "share_common")
+
+
+def stamp_ns(header: Any) -> int:
+    """Stamp of a std_msgs/Header [ns]."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def edges_from_message(message: Any) -> EdgeObservation:
+    """Observation of a knee_gap_msgs/GapEdges."""
+    return EdgeObservation(
+        stamp_ns=stamp_ns(message.header),
+        track_id=int(message.track_id),
+        usable=int(message.status) == VALID_EDGES and int(message.track_id) != 0,
+        bearings=np.array([[b.x, b.y, b.z] for b in (message.bearing_0, message.bearing_1)], dtype=float),
+        covariances=np.array([message.covariance_0, message.covariance_1], dtype=float).reshape(2, 3, 3),
+        angular_error=float(message.angular_error),
+        status=int(message.status),
+    )
+
+
+def pose_from_message(message: Any) -> LensPose:
+    """Lens pose of a geometry_msgs/PoseWithCovarianceStamped."""
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    return LensPose(
+        stamp_ns=stamp_ns(message.header),
+        frame_id=str(message.header.frame_id),
+        position=np.array([p.x, p.y, p.z], dtype=float),
+        quaternion_xyzw=np.array([q.x, q.y, q.z, q.w], dtype=float),
+        covariance=np.array(message.pose.covariance, dtype=float).reshape(6, 6),
+    )
+
+
+def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/GapEstimate; returns the message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(estimate.stamp_ns, 1_000_000_000)
+    message.header.frame_id = estimate.frame_id
+    message.status = int(estimate.status)
+    message.track_id = estimate.track_id
+    message.interval = INTERVALS[estimate.interval]
+    for name in ("gap", "gap_min", "gap_max", "snr", "confidence_level", "confidence_min", "confidence_max"):
+        setattr(message, name, float(getattr(estimate, name)))
+    for name in ("baseline", "parallax", "translation_to_target"):
+        setattr(message, name, float(getattr(estimate, name)))
+    message.view_count = estimate.view_count
+    for point, values in zip((message.point_0, message.point_1), estimate.points, strict=True):
+        point.x, point.y, point.z = (float(value) for value in values)
+    for name, share in zip(SHARES, estimate.shares, strict=True):
+        setattr(message, name, float(share))
+    return message

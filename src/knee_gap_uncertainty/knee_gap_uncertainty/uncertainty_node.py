@@ -1,0 +1,76 @@
+"""uncertainty_node: gap_edges and scope_pose in; gap, gap/min, gap/max and gap/snr out."""
+
+import time
+from collections.abc import Mapping, Sequence
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+
+from knee_gap_msgs.msg import GapEdges, GapEstimate
+from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
+from knee_gap_uncertainty import gap_estimate, messages
+from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.gap_range import warm_up
+
+# A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
+GAP_DEADLINE = Duration(nanoseconds=100_000_000)
+# How often time is let pass when no message does it.
+TICK = 0.005
+
+
+class UncertaintyNode(BaseNode):
+    """Converts, calls the estimator, publishes."""
+
+    def __init__(self) -> None:
+        super().__init__("uncertainty_node", health=self.health)
+        self._estimator = GapEstimator(self.declare(EstimatorParameters))
+        self.refuse_unknown_parameters()
+        # Compiled before the first image, so that its estimate is not late.
+        warm_up()
+        gap_qos = QoSProfile(
+            depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=GAP_DEADLINE
+        )
+        self._gap = self.create_publisher(GapEstimate, "gap", gap_qos)
+        self._numbers = {
+            name: self.create_publisher(Float64, f"gap/{topic}", RESULT_QOS)
+            for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr"))
+        }
+        self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
+        self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
+        self._tick = self.create_timer(
+            TICK, lambda: self.publish(self._estimator.advance(time.monotonic_ns()))
+        )
+
+    def on_edges(self, message: GapEdges) -> None:
+        """Estimate at an image."""
+        self.publish(self._estimator.add_edges(messages.edges_from_message(message), time.monotonic_ns()))
+
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Take a lens pose, which may complete images that waited for it."""
+        self.publish(self._estimator.add_pose(messages.pose_from_message(message), time.monotonic_ns()))
+
+    def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
+        """Publish each estimate; the plain numbers only where they are valid."""
+        for estimate in estimates:
+            self._gap.publish(messages.fill_gap_estimate(GapEstimate(), estimate))
+            if estimate.status is gap_estimate.GapStatus.VALID:
+                for name, publisher in self._numbers.items():
+                    publisher.publish(Float64(data=float(getattr(estimate, name))))
+            elif estimate.reason:
+                self.log_once(estimate.reason, f"{estimate.status.name}: {estimate.reason}")
+
+    def health(self) -> tuple[bool, str, Mapping[str, object]]:
+        """Status of the latest estimate, and how often each status and reason came."""
+        latest = self._estimator.latest
+        if latest is None:
+            return False, "no edges received yet", {}
+        well = latest.status is gap_estimate.GapStatus.VALID
+        return well, latest.reason or latest.status.name, self._estimator.counts
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(UncertaintyNode, argv)
