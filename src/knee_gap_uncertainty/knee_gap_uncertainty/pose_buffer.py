@@ -1,0 +1,146 @@
+"""Lens poses kept for a short while, and the pose at the moment of an image, between two of them."""
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+from math import isfinite
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from knee_gap_uncertainty.errors import BadInputError
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LensPose:
+    """Pose of the lens at a stamp, with its error: the fields of geometry_msgs/PoseWithCovarianceStamped.
+
+    `position` (3,) [m] and `quaternion_xyzw` (4,) map lens coordinates to `frame_id`; `covariance` (6, 6) is
+    in the order x, y, z [m^2], rotation about the fixed axes x, y, z of `frame_id` [rad^2] (REP-103).
+    """
+
+    stamp_ns: int
+    frame_id: str
+    position: Array
+    quaternion_xyzw: Array
+    covariance: Array
+
+
+class PoseRefusal(StrEnum):
+    """Why a pose is not kept, or why there is none at a stamp."""
+
+    NOT_FINITE = "the lens pose has numbers that are NaN or infinite"
+    NOT_UNIT = "the lens pose's quaternion is not of length 1"
+    DUPLICATE = "the lens pose has the stamp of the one before it"
+    NOT_YET = "no lens pose follows the stamp yet"
+    TOO_OLD = "the stamp is before the first lens pose that is kept"
+    GAP = "a lens pose around the stamp is further from it than max_pose_age"
+
+
+class PoseBuffer:
+    """The latest poses of the lens, in the order of their stamps; interpolates between two, never beyond one.
+
+    `max_pose_age` [s] is the longest time between the stamp asked for and either of its two poses; `capacity`
+    the number of poses kept. Between poses the lens does not move evenly: `acceleration` [m/s^2] and
+    `angular_acceleration` [rad/s^2] are the RMS lengths of a hand's, whose effect on the interpolated pose
+    its covariance includes.
+
+    Raises BadInputError for settings outside their range.
+    """
+
+    def __init__(
+        self,
+        max_pose_age: float = 0.05,
+        *,
+        capacity: int = 2048,
+        acceleration: float = 0.5,
+        angular_acceleration: float = 2.0,
+    ) -> None:
+        if not 0.0 < max_pose_age < 10.0:
+            raise BadInputError(f"max_pose_age must lie in (0, 10) s, not {max_pose_age}")
+        if capacity < 2:
+            raise BadInputError(f"the pose buffer must keep at least 2 poses, not {capacity}")
+        for name, value in (("acceleration", acceleration), ("angular_acceleration", angular_acceleration)):
+            if not (value >= 0.0 and isfinite(value)):
+                raise BadInputError(f"{name} must be finite and not negative, not {value}")
+        self.max_pose_age = max_pose_age
+        self.reset_count = 0
+        self._acceleration = acceleration
+        self._angular_acceleration = angular_acceleration
+        self._poses: deque[LensPose] = deque(maxlen=capacity)
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def newest_stamp_ns(self) -> int | None:
+        """Stamp of the newest pose; None while empty."""
+        return self._poses[-1].stamp_ns if self._poses else None
+
+    def clear(self) -> None:
+        """Forget all poses."""
+        self._poses.clear()
+
+    def add(self, pose: LensPose) -> PoseRefusal | None:
+        """Keep a pose, or return why not.
+
+        A stamp before the newest one (a bag that starts again) or another frame empties the buffer first.
+        """
+        if refusal := _refusal(pose):
+            return refusal
+        if self._poses:
+            newest = self._poses[-1]
+            if pose.frame_id == newest.frame_id and pose.stamp_ns == newest.stamp_ns:
+                return PoseRefusal.DUPLICATE
+            if pose.frame_id != newest.frame_id or pose.stamp_ns < newest.stamp_ns:
+                self.clear()
+                self.reset_count += 1
+        self._poses.append(pose)
+        return None
+
+    def at(self, stamp_ns: int) -> LensPose | PoseRefusal:
+        """Return the pose at a stamp, or why there is none; positions linearly, rotations by slerp."""
+        if not self._poses or stamp_ns > self._poses[-1].stamp_ns:
+            return PoseRefusal.NOT_YET
+        if stamp_ns < self._poses[0].stamp_ns:
+            return PoseRefusal.TOO_OLD
+        index = bisect_left(self._poses, stamp_ns, key=lambda pose: pose.stamp_ns)
+        after = self._poses[index]
+        if after.stamp_ns == stamp_ns:
+            return after
+        before = self._poses[index - 1]
+        age = round(self.max_pose_age * 1e9)
+        if stamp_ns - before.stamp_ns > age or after.stamp_ns - stamp_ns > age:
+            return PoseRefusal.GAP
+        return self._between(before, after, stamp_ns)
+
+    def _between(self, before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
+        since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9
+        share = since / (since + until)
+        start, end = Rotation.from_quat(before.quaternion_xyzw), Rotation.from_quat(after.quaternion_xyzw)
+        turn = (end * start.inv()).as_rotvec()
+        # The errors of neighbouring poses may be common, so they are not averaged down.
+        covariance: Array = (1.0 - share) * before.covariance + share * after.covariance
+        # A constant acceleration a bends the path by a s u / 2, s after one and u before the other pose.
+        bend = since * until / 2.0
+        accelerations = np.repeat([self._acceleration, self._angular_acceleration], 3)
+        return LensPose(
+            stamp_ns=stamp_ns,
+            frame_id=after.frame_id,
+            position=(1.0 - share) * before.position + share * after.position,
+            quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
+            covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
+        )
+
+
+def _refusal(pose: LensPose) -> PoseRefusal | None:
+    numbers = np.concatenate([pose.position, pose.quaternion_xyzw, np.ravel(pose.covariance)])
+    if not np.isfinite(numbers).all():
+        return PoseRefusal.NOT_FINITE
+    if abs(float(np.linalg.norm(pose.quaternion_xyzw)) - 1.0) > 1e-3:
+        return PoseRefusal.NOT_UNIT
+    return None
