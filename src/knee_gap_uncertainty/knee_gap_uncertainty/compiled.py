@@ -9,6 +9,8 @@ from typing import Any
 import numba
 
 MARK = "@compiled"
+# What `fastmath` lets the compiler assume: no NaN, and sums in any order. Infinities stay infinities.
+FAST = {"nnan", "nsz", "reassoc", "contract"}
 
 
 @cache
@@ -28,7 +30,8 @@ def compiled(function: Callable[..., Any] | None = None, *, fastmath: bool = Fal
     if function is None:
         return lambda decorated: compiled(decorated, fastmath=fastmath)
     function.__qualname__ += f"_{sources_digest()}"
+    options: dict[str, Any] = {"error_model": "numpy", "fastmath": FAST if fastmath else False}
     try:
-        return numba.njit(cache=True, error_model="numpy", fastmath=fastmath)(function)
+        return numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        return numba.njit(error_model="numpy", fastmath=fastmath)(function)
+        return numba.njit(**options)(function)

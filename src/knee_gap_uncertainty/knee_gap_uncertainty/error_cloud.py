@@ -1,0 +1,150 @@
+"""Where a point of the gap may be, given all admitted errors: equations (21)-(25), from either lens.
+
+A cloud is seen from the ray's own lens, its apex, which is at the origin: the clouds of b_n have A0 as apex
+and the travel t, those of a_n have A1 and -t. Everything below is written for the one and serves for the
+other.
+"""
+
+import math
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.angle_sets import SIGNS, Signs, perturbed_angles
+from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.errors import ParallelToTravelError
+from knee_gap_uncertainty.translation_volume import displaced_travel, displacements
+from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE, ray_length, triangle_angles
+from knee_gap_uncertainty.two_views import TwoViews
+from knee_gap_uncertainty.vectors import Vector, add, cross, norm, scale, unit
+
+Apex: TypeAlias = Literal["first", "second"]
+
+# Rotations phi of Delta g about the ray, each taken both ways: eight spokes of a ring of points about the
+# ray.
+PHI = (0.0, math.pi / 6, math.pi / 4, math.pi / 2)
+COS_PHI = np.cos(PHI)
+SIN_PHI = np.sin(PHI)
+SPOKES = 2 * len(PHI)
+
+# Where a ray under admitted errors meets the other nowhere, its point is put this many travels away: no
+# distance is taken to it, but it tells which way the cloud goes on without end.
+FAR = 1e3
+
+
+class ErrorCloud(NamedTuple):
+    """Points around one end of the gap.
+
+    `points` (3, 8, rings): coordinates, spokes, rings [m], apex at the origin. `lengths` (rings,): L' of each
+    ring [m]. Only the first `bounded` rings are places where the point may be; the others stand for rays that
+    do not meet. `smallest_angle`: least angle alpha' or beta' among all [rad]; a negative one is none.
+    """
+
+    points: npt.NDArray[np.float64]
+    lengths: npt.NDArray[np.float64]
+    bounded: int
+    smallest_angle: float
+
+
+@compiled
+def draw_ring(
+    points: npt.NDArray[np.float64],
+    ring: int,
+    apex: Vector,
+    bearing: Vector,
+    across: Vector,
+    length: float,
+    angular_error: float,
+) -> None:
+    """Write the ring of points at `length` [m] from the displaced apex, psi about the bearing: (21)-(23).
+
+    `across` is the direction of Delta g, (24); the spokes are it and its opposite, turned by phi about the
+    bearing.
+    """
+    third = cross(bearing, across)
+    centre = add(apex, scale(length * math.cos(angular_error), bearing))
+    radius = length * math.sin(angular_error)
+    for i in range(COS_PHI.size):
+        spoke = add(scale(radius * COS_PHI[i], across), scale(radius * SIN_PHI[i], third))
+        for axis in range(3):
+            points[axis, 2 * i, ring] = centre[axis] + spoke[axis]
+            points[axis, 2 * i + 1, ring] = centre[axis] - spoke[axis]
+
+
+@compiled
+def trace_cloud(
+    travel: Vector,
+    own: Vector,
+    other: Vector,
+    angular_error: float,
+    shifts: npt.NDArray[np.float64],
+    signs: npt.NDArray[np.float64],
+) -> ErrorCloud:
+    """Cloud about the end of the ray `own`, for all `shifts` of both lenses and all rows of `signs`.
+
+    `travel` leads from the ray's own lens to the other one; `other` is the bearing from there.
+    """
+    rings = shifts.shape[0] ** 2 * signs.shape[0]
+    points = np.empty((3, SPOKES, rings))
+    lengths = np.empty(rings)
+    smallest_angle = math.inf
+    bounded, unbounded = 0, rings
+    for p in range(shifts.shape[0]):
+        apex = (shifts[p, 0], shifts[p, 1], shifts[p, 2])
+        for q in range(shifts.shape[0]):
+            displaced = displaced_travel(travel, apex, (shifts[q, 0], shifts[q, 1], shifts[q, 2]))
+            distance = norm(displaced)
+            angles = triangle_angles(displaced, own, other)
+            across = unit(cross(own, cross(displaced, own)))
+            smallest_angle = min(smallest_angle, math.pi - max(angles))
+            for k in range(signs.shape[0]):
+                own_angle, other_angle = perturbed_angles(angles, signs[k], angular_error)
+                smallest_angle = min(smallest_angle, own_angle, other_angle)
+                if own_angle + other_angle < math.pi:
+                    ring, length = bounded, ray_length(distance, own_angle, other_angle)
+                    bounded += 1
+                else:
+                    unbounded -= 1
+                    ring, length = unbounded, FAR * distance
+                lengths[ring] = length
+                draw_ring(points, ring, apex, own, across, length, angular_error)
+    return ErrorCloud(points, lengths, bounded, smallest_angle)
+
+
+def error_clouds(
+    views: TwoViews,
+    *,
+    angular_error: float,
+    translation_error: float,
+    signs: Signs = "all",
+    apex: Apex = "first",
+    radii: int = 1,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The clouds E0 and E1 about the two points (N, 3) [m], in the frame of the views; errors in rad and m.
+
+    Only places at a finite distance are listed. Raises ParallelToTravelError where an admitted error turns a
+    bearing into the direction of travel.
+    """
+    first = apex == "first"
+    travel = tuple(views.travel if first else -views.travel)
+    lens = views.lens_0 if first else views.lens_1
+    own, other = (views.bearings_0, views.bearings_1) if first else (views.bearings_1, views.bearings_0)
+    shifts = displacements(translation_error, radii)
+    clouds = []
+    for n in range(2):
+        cloud = ErrorCloud(
+            *trace_cloud(travel, tuple(own[n]), tuple(other[n]), angular_error, shifts, SIGNS[signs])
+        )
+        refuse_parallel(cloud.smallest_angle)
+        clouds.append(lens + cloud.points[:, :, : cloud.bounded].reshape(3, -1).T)
+    return clouds[0], clouds[1]
+
+
+def refuse_parallel(smallest_angle: float) -> None:
+    """Raise ParallelToTravelError where the least angle [rad] of a cloud leaves no triangle."""
+    if not smallest_angle > SMALLEST_ANGLE:
+        raise ParallelToTravelError(
+            "under the admitted errors a bearing lies along the travel: the angle between them, less the "
+            f"angular error, must be positive, it is {math.degrees(smallest_angle):.3g} deg"
+        )

@@ -1,0 +1,173 @@
+"""The gap from two views, the least and greatest value that admitted errors allow, and the ratio (26)."""
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS, Interval
+from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.error_cloud import refuse_parallel, trace_cloud
+from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
+from knee_gap_uncertainty.extremes import extremes, slice_cloud
+from knee_gap_uncertainty.overlap import hulls_meet
+from knee_gap_uncertainty.translation_volume import displacements
+from knee_gap_uncertainty.triangulation import triangulate
+from knee_gap_uncertainty.two_views import TwoViews, two_views
+from knee_gap_uncertainty.vectors import subtract
+
+LARGEST_ANGULAR_ERROR = math.pi / 2
+# The clouds grow with the square of the radii: 30 hold four million points each.
+MOST_RADII = 30
+
+
+class GapRange(NamedTuple):
+    """A gap [m] with its bounds [m] and its signal-to-noise ratio gap / (gap_max - gap_min), (26).
+
+    `gap_max` is infinite, and `snr` zero, where the admitted errors let a point lie at infinity; `gap_min` is
+    zero where the clouds of the two points overlap. Without any error the bounds are the gap and `snr` is
+    infinite.
+    """
+
+    gap: float
+    gap_min: float
+    gap_max: float
+    snr: float
+
+
+def gap_range(
+    lens_0: npt.ArrayLike,
+    lens_1: npt.ArrayLike,
+    bearings_0: npt.ArrayLike,
+    bearings_1: npt.ArrayLike,
+    *,
+    angular_error: float,
+    translation_error: float,
+    interval: Interval = "worst_case",
+    apex: Literal["first", "second", "best"] = "first",
+    radii: int = 1,
+) -> GapRange:
+    """Gap between two points seen from two lens positions, with bounds.
+
+    `lens_0`, `lens_1`: positions (3,) [m]; `bearings_0`, `bearings_1`: unit vectors (2, 3) from each to G0
+    and G1, all in one frame. `angular_error` psi = theta + omega [rad] and `translation_error` Delta T [m]
+    bound the errors of each bearing and of each position. `interval`: "worst_case" admits every sign in (17)
+    and (18), "paper" none, as Table 4. `apex`: clouds of the rays of the "first" lens, the "second", or the
+    "best" of both, which has the higher ratio. `radii`: displacements of the lens in so many equal steps up
+    to the translation error; 1 is the outer shell.
+
+    Raises BadInputError, TravelTooShortError, ParallelToTravelError, RaysMeetBehindError or UnboundedError,
+    all of them MeasurementError, where no honest range exists.
+    """
+    signs = checked_choices(interval, apex, radii)
+    psi = checked_error("angular_error", angular_error, "rad")
+    if psi >= LARGEST_ANGULAR_ERROR:
+        raise BadInputError(f"angular_error must be below pi/2 rad, got {psi:g}: a wider cone is no bearing")
+    shift = checked_error("translation_error", translation_error, "m")
+    views = two_views(lens_0, lens_1, bearings_0, bearings_1)
+    if 2 * shift >= views.baseline:
+        raise TravelTooShortError(
+            f"the travel must exceed twice the translation error: "
+            f"|t| = {views.baseline:.6g} m, 2 DT = {2 * shift:.6g} m"
+        )
+    points = triangulate(views)
+    shifts = displacements(shift, radii)
+    ranges = []
+    if apex != "second":
+        ranges.append(range_from_apex(points.gap_first, views, psi, shifts, signs))
+    if apex != "first":
+        ranges.append(range_from_apex(points.gap_second, reversed_views(views), psi, shifts, signs))
+    return max(ranges, key=lambda found: (found.snr, found.gap_min))
+
+
+def range_from_apex(
+    gap: float,
+    views: TwoViews,
+    angular_error: float,
+    shifts: npt.NDArray[np.float64],
+    signs: npt.NDArray[np.float64],
+) -> GapRange:
+    """Range of a gap [m] by the clouds of the rays of the first lens of `views`."""
+    if angular_error == 0 and not shifts.any():
+        return GapRange(gap, gap, gap, math.inf)
+    gap_min, gap_max, smallest_angle = cloud_range(
+        views.travel, views.bearings_0, views.bearings_1, angular_error, shifts, signs
+    )
+    refuse_parallel(smallest_angle)
+    width = gap_max - gap_min
+    return GapRange(gap, gap_min, gap_max, gap / width if width > 0 else math.inf)
+
+
+@compiled
+def cloud_range(
+    travel: npt.NDArray[np.float64],
+    own: npt.NDArray[np.float64],
+    other: npt.NDArray[np.float64],
+    angular_error: float,
+    shifts: npt.NDArray[np.float64],
+    signs: npt.NDArray[np.float64],
+) -> tuple[float, float, float]:
+    """Least and greatest distance of the clouds of both points [m], least angle of all triangles [rad].
+
+    `travel` (3,) leads from the lens with the bearings `own` (2, 3) to the one with `other` (2, 3).
+    """
+    t = (travel[0], travel[1], travel[2])
+    own_0, own_1 = (own[0, 0], own[0, 1], own[0, 2]), (own[1, 0], own[1, 1], own[1, 2])
+    cloud_0 = trace_cloud(t, own_0, (other[0, 0], other[0, 1], other[0, 2]), angular_error, shifts, signs)
+    cloud_1 = trace_cloud(t, own_1, (other[1, 0], other[1, 1], other[1, 2]), angular_error, shifts, signs)
+    smallest_angle = min(cloud_0.smallest_angle, cloud_1.smallest_angle)
+    if not smallest_angle > 0.0:
+        return math.nan, math.nan, smallest_angle
+    nearest, farthest = extremes(
+        slice_cloud(cloud_0.points[:, :, : cloud_0.bounded], cloud_0.lengths[: cloud_0.bounded]),
+        slice_cloud(cloud_1.points[:, :, : cloud_1.bounded], cloud_1.lengths[: cloud_1.bounded]),
+    )
+    if hulls_meet(cloud_0.points.reshape(3, -1), cloud_1.points.reshape(3, -1), subtract(own_0, own_1)):
+        nearest = 0.0
+    if cloud_0.bounded < cloud_0.lengths.size or cloud_1.bounded < cloud_1.lengths.size:
+        farthest = math.inf
+    return nearest, farthest, smallest_angle
+
+
+def reversed_views(views: TwoViews) -> TwoViews:
+    """The same views, the second first."""
+    return TwoViews(views.lens_1, views.lens_0, views.bearings_1, views.bearings_0)
+
+
+def checked_error(name: str, value: float, unit: str) -> float:
+    """The error as a float that is finite and not negative; BadInputError says what it is otherwise."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise BadInputError(f"{name} must be a number [{unit}], got {value!r}") from None
+    if not (math.isfinite(number) and number >= 0):
+        raise BadInputError(f"{name} must be finite and not negative [{unit}], got {number!r}")
+    return number
+
+
+def checked_choices(interval: str, apex: str, radii: int) -> npt.NDArray[np.float64]:
+    """Rows of signs of the interval; BadInputError for a name or number that is no choice."""
+    if interval not in INTERVAL_SIGNS:
+        raise BadInputError(f"interval must be one of {', '.join(INTERVAL_SIGNS)}, got {interval!r}")
+    if apex not in ("first", "second", "best"):
+        raise BadInputError(f"apex must be one of first, second, best, got {apex!r}")
+    if isinstance(radii, bool) or not isinstance(radii, int | np.integer) or not 1 <= radii <= MOST_RADII:
+        raise BadInputError(f"radii must be a whole number from 1 to {MOST_RADII}, got {radii!r}")
+    return SIGNS[INTERVAL_SIGNS[interval]]
+
+
+def warm_up() -> None:
+    """Compile, or load from disk, all that `gap_range` runs, so that the first image is not late."""
+    gap_range(
+        (0.0, 0.0, 0.0),
+        (0.003, 0.0, 0.0),
+        ((0.0, 0.0, 1.0), (0.0, 0.6, 0.8)),
+        (
+            (-0.28734788556634544, 0.0, 0.9578262852211514),
+            (-0.28734788556634544, 0.574695771132691, 0.7662610281769211),
+        ),
+        angular_error=0.01,
+        translation_error=1e-5,
+        apex="best",
+    )

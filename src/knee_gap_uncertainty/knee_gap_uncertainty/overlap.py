@@ -1,0 +1,105 @@
+"""Whether two clouds overlap: whether their convex hulls meet.
+
+The clouds are samples of volumes that are very nearly convex (the frustum of a cone, blurred by the displaced
+lens), so where hulls meet, the two points of the gap may be one, and the smallest distance between samples
+says nothing. Decided by the point of the hulls' difference that is closest to the origin (Gilbert, Johnson,
+Keerthi 1988).
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.vectors import Vector, add, cross, dot, norm, scale, subtract
+
+# Hulls closer than this share of their extent touch. The search takes about ten steps; one that does not end,
+# because the hulls very nearly touch, is decided the safe way.
+TOUCHING = 1e-9
+MOST_STEPS = 100
+
+
+@compiled
+def hulls_meet(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], guess: Vector) -> bool:
+    """Whether the convex hulls of two clouds (3, n) and (3, m) have a point in common.
+
+    `guess` is a direction from the other cloud to this one, tried first as normal of a plane between them.
+    """
+    simplex = np.empty((4, 3))
+    count = 0
+    closest = guess
+    extent = 0.0
+    for _ in range(MOST_STEPS):
+        corner = subtract(extreme_point(one, scale(-1.0, closest)), extreme_point(other, closest))
+        extent = max(extent, norm(corner))
+        if dot(closest, corner) > TOUCHING * extent * norm(closest):
+            return False
+        simplex[count] = corner
+        count, closest = closest_of_simplex(simplex, count + 1)
+        if norm(closest) <= TOUCHING * extent:
+            return True
+    return True
+
+
+@compiled(fastmath=True)
+def extreme_point(points: npt.NDArray[np.float64], direction: Vector) -> Vector:
+    """Column that lies farthest in the direction."""
+    along = direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2]
+    chosen = along.argmax()
+    return points[0, chosen], points[1, chosen], points[2, chosen]
+
+
+@compiled
+def closest_of_simplex(simplex: npt.NDArray[np.float64], count: int) -> tuple[int, Vector]:
+    """Point of the simplex of the first `count` rows that is closest to the origin.
+
+    It is the foot of the origin on one of the faces, inside that face; the closest such foot of all is the
+    answer. `simplex` is left with the corners of that face, whose number is returned with the point.
+    """
+    best = math.inf
+    closest = (0.0, 0.0, 0.0)
+    face = 0
+    for candidate in range(1, 1 << count):
+        inside, foot = foot_on_face(simplex, candidate)
+        if inside and dot(foot, foot) < best:
+            best, closest, face = dot(foot, foot), foot, candidate
+    kept = 0
+    for i in range(count):
+        if face >> i & 1:
+            simplex[kept] = simplex[i]
+            kept += 1
+    return kept, closest
+
+
+@compiled
+def foot_on_face(simplex: npt.NDArray[np.float64], face: int) -> tuple[bool, Vector]:
+    """Foot of the origin on the face of the corners whose bits are set, and whether it lies within it."""
+    corners = np.zeros((4, 3))
+    count = 0
+    for i in range(4):
+        if face >> i & 1:
+            corners[count] = simplex[i]
+            count += 1
+    a, b, c, d = (
+        (corners[0, 0], corners[0, 1], corners[0, 2]),
+        (corners[1, 0], corners[1, 1], corners[1, 2]),
+        (corners[2, 0], corners[2, 1], corners[2, 2]),
+        (corners[3, 0], corners[3, 1], corners[3, 2]),
+    )
+    if count == 1:
+        return True, a
+    if count == 2:
+        edge = subtract(b, a)
+        share = -dot(a, edge) / dot(edge, edge)
+        return 0.0 < share < 1.0, add(a, scale(share, edge))
+    if count == 3:
+        normal = cross(subtract(b, a), subtract(c, a))
+        inside = (
+            dot(normal, cross(b, c)) > 0.0
+            and dot(normal, cross(c, a)) > 0.0
+            and dot(normal, cross(a, b)) > 0.0
+        )
+        return inside, scale(dot(normal, a) / dot(normal, normal), normal)
+    volumes = (dot(b, cross(c, d)), -dot(a, cross(c, d)), dot(a, cross(b, d)), -dot(a, cross(b, c)))
+    return min(volumes) > 0.0 or max(volumes) < 0.0, (0.0, 0.0, 0.0)

@@ -1,0 +1,121 @@
+"""Two bearings and the travel between them to a point, and two points to a gap: equations (1)-(6).
+
+The labelling is the only one with which (1)-(5) give a positive parallax: b_n is the bearing from the first
+lens A0 to the point G_n, a_n the one from the second lens A1, and t = A1 - A0.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.errors import ParallelToTravelError, RaysMeetBehindError, UnboundedError
+from knee_gap_uncertainty.two_views import TwoViews
+from knee_gap_uncertainty.vectors import Vector, angle, scale
+
+# Angles closer to 0 or pi than this cannot be told from it in double precision.
+SMALLEST_ANGLE = 1e-9
+
+
+@compiled
+def triangle_angles(travel: Vector, own: Vector, other: Vector) -> tuple[float, float]:
+    """Angles of the triangle at the lens where `travel` starts and where it ends [rad], (3) and (4).
+
+    `own` is the bearing from the first of them, `other` from the second. With (t, b_n, a_n) they are alpha_n
+    and beta_n; with (-t, a_n, b_n) the same two the other way round.
+    """
+    return angle(travel, own), angle(scale(-1.0, travel), other)
+
+
+@compiled
+def ray_length(travel: float, own_angle: float, other_angle: float) -> float:
+    """Length of the ray from the lens of `own_angle`, by the sine rule: (2) for b_n, (1) for a_n.
+
+    `travel` is the distance of the lenses; sin gamma = sin(alpha + beta) by (5).
+    """
+    return travel * math.sin(other_angle) / math.sin(own_angle + other_angle)
+
+
+class Triangulation(NamedTuple):
+    """Both points as seen from either lens; index n of each array is the point G_n.
+
+    `alpha`, `beta`, `gamma` (2,): angles at the first lens, the second lens and the point [rad].
+    `points_first` and `points_second` (2, 3): where (2) and (1) put the points [m]; they differ where the
+    rays do not meet.
+    """
+
+    alpha: npt.NDArray[np.float64]
+    beta: npt.NDArray[np.float64]
+    gamma: npt.NDArray[np.float64]
+    points_first: npt.NDArray[np.float64]
+    points_second: npt.NDArray[np.float64]
+
+    @property
+    def gap_first(self) -> float:
+        """Gap |b_1 - b_0| by (6) [m]."""
+        return float(np.linalg.norm(self.points_first[1] - self.points_first[0]))
+
+    @property
+    def gap_second(self) -> float:
+        """Gap |a_1 - a_0| by (6) [m]."""
+        return float(np.linalg.norm(self.points_second[1] - self.points_second[0]))
+
+
+def triangulate(views: TwoViews) -> Triangulation:
+    """Both points from both lenses, (1)-(5).
+
+    Raises ParallelToTravelError, RaysMeetBehindError or UnboundedError where a pair of rays gives no point.
+    """
+    angles = np.empty((2, 2))
+    lengths = np.empty((2, 2))
+    for n, (own, other) in enumerate(zip(views.bearings_0, views.bearings_1, strict=True)):
+        angles[n] = triangle_angles(tuple(views.travel), tuple(own), tuple(other))
+        refuse_bad_triangle(n, views.travel, own, other, *angles[n])
+        lengths[n] = (
+            ray_length(views.baseline, angles[n, 0], angles[n, 1]),
+            ray_length(views.baseline, angles[n, 1], angles[n, 0]),
+        )
+    return Triangulation(
+        alpha=angles[:, 0],
+        beta=angles[:, 1],
+        gamma=math.pi - angles.sum(axis=1),
+        points_first=views.lens_0 + lengths[:, :1] * views.bearings_0,
+        points_second=views.lens_1 + lengths[:, 1:] * views.bearings_1,
+    )
+
+
+def refuse_bad_triangle(
+    n: int,
+    travel: npt.NDArray[np.float64],
+    own: npt.NDArray[np.float64],
+    other: npt.NDArray[np.float64],
+    alpha: float,
+    beta: float,
+) -> None:
+    """Raise what is wrong with the rays to point n, if anything is."""
+    for name, value in (("first", alpha), ("second", beta)):
+        if not SMALLEST_ANGLE < value < math.pi - SMALLEST_ANGLE:
+            raise ParallelToTravelError(
+                f"the bearing from the {name} lens to point {n} lies along the travel "
+                f"({math.degrees(value):.3g} deg from it): it must span a triangle with it"
+            )
+    gamma = math.pi - alpha - beta
+    if abs(angle(tuple(own), tuple(other))) < SMALLEST_ANGLE:
+        raise UnboundedError(f"the rays to point {n} are parallel: the point is at infinity")
+    depth_own, depth_other = closest_approach(travel, own, other)
+    if gamma <= 0 or depth_own <= 0 or depth_other <= 0:
+        raise RaysMeetBehindError(
+            f"the rays to point {n} must meet in front of both lenses: parallax "
+            f"{math.degrees(gamma):.3g} deg, closest at {depth_own:.3g} m and {depth_other:.3g} m along them"
+        )
+
+
+def closest_approach(
+    travel: npt.NDArray[np.float64], own: npt.NDArray[np.float64], other: npt.NDArray[np.float64]
+) -> tuple[float, float]:
+    """Distances along the two rays to where they come closest [m]; negative is behind the lens."""
+    normal = np.cross(own, other)
+    squared = float(normal @ normal)
+    return float(np.cross(travel, other) @ normal) / squared, float(np.cross(travel, own) @ normal) / squared
