@@ -34,7 +34,7 @@ LATCHED_QOS = QoSProfile(
 Health = tuple[bool, str, Mapping[str, object]]
 
 
-class BaseNode(Node):  # type: ignore[misc]  # rclpy is untyped
+class BaseNode(Node):
     """A node whose parameters come from a dataclass and that says once a second how it fares."""
 
     def __init__(self, name: str, *, health: Callable[[], Health]) -> None:
@@ -85,6 +85,7 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        node.get_logger().info("ready")
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

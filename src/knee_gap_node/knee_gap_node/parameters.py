@@ -6,8 +6,8 @@ track would make one estimate out of two.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, Field, fields
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from dataclasses import Field, fields
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
@@ -44,7 +44,7 @@ def as_ros_default(value: Any) -> Any:
 
 
 def declare(node: Any, kind: type[Parameters]) -> Parameters:
-    """Declare every field of `kind` on `node` and return the instance that the given values make.
+    """Declare every field of `kind`, each with a default, on `node`; return the instance that the values make.
 
     Raises:
         ConfigurationError: a value of the wrong type, outside its range or refused by the dataclass itself.
@@ -52,12 +52,11 @@ def declare(node: Any, kind: type[Parameters]) -> Parameters:
     """
     hints = get_type_hints(kind)
     values = {}
-    for field in fields(kind):  # type: ignore[arg-type]
-        default = field.default if field.default is not MISSING else field.default_factory()  # type: ignore[misc]
+    for field in fields(kind):  # type: ignore[arg-type]  # any dataclass
         hint = hints[field.name]
         try:
             given = node.declare_parameter(
-                field.name, as_ros_default(default), descriptor_of(field, hint)
+                field.name, as_ros_default(field.default), descriptor_of(field, hint)
             ).value
         except Exception as error:  # rclpy's own family has no common base but Exception
             raise ConfigurationError(_one_line(field.name, field, hint, error)) from error

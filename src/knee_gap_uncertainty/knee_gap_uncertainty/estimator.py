@@ -91,9 +91,8 @@ class GapEstimator:
     def _try(self, pending: Pending, now_ns: int) -> GapEstimate | None:
         """Estimate of one image, or None while its lens pose may still come."""
         edges = pending.edges
-        if not edges.usable:
-            reason = f"the image gave no usable edges (edge status {edges.status})"
-            return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, reason)
+        if flaw := edges.flaw():
+            return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, flaw)
         pose = self._poses.at(edges.stamp_ns)
         if isinstance(pose, LensPose):
             return self._measure(edges, pose)

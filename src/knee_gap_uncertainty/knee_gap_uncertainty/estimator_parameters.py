@@ -1,6 +1,7 @@
 """Settings of the estimator, each with its meaning and the values it takes."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from knee_gap_uncertainty.errors import MeasurementError
 
@@ -9,7 +10,7 @@ from knee_gap_uncertainty.errors import MeasurementError
 class EstimatorParameters:
     """Settings of GapEstimator, validated where they are built; SI units."""
 
-    interval: str = field(
+    interval: Literal["worst_case", "paper"] = field(
         default="worst_case",
         metadata={
             "description": "error model of gap_min, gap_max and snr: worst_case is the safety interval, "
@@ -17,7 +18,7 @@ class EstimatorParameters:
             "choices": ("worst_case", "paper"),
         },
     )
-    apex: str = field(
+    apex: Literal["first", "second", "best"] = field(
         default="best",
         metadata={
             "description": "view whose rays carry the error clouds; best: the higher signal-to-noise ratio",

@@ -1,12 +1,14 @@
 """What is published of the gap, and of an observation of its edges: the values that go in and come out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
 NAN = float("nan")
+# Rounding on the way, not a wrong vector.
+UNIT_TOLERANCE = 1e-6
 
 
 class GapStatus(IntEnum):
@@ -21,7 +23,7 @@ class GapStatus(IntEnum):
     JOINT_MOVED = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EdgeObservation:
     """The two points in one image.
 
@@ -38,8 +40,20 @@ class EdgeObservation:
     angular_error: float
     status: int = 0
 
+    def flaw(self) -> str:
+        """Why the observation cannot be used, in words; empty if it can."""
+        if not self.usable:
+            return f"the image gave no usable edges (edge status {self.status})"
+        if not (np.isfinite(self.bearings).all() and np.isfinite(self.covariances).all()):
+            return "the edges say valid and carry numbers that are not finite"
+        if np.abs(np.linalg.norm(self.bearings, axis=1) - 1.0).max() > UNIT_TOLERANCE:
+            return "the edges say valid and carry bearings that are no unit vectors"
+        if not 0.0 <= self.angular_error < np.pi / 2:
+            return "the edges say valid and carry an angular error outside [0, pi/2)"
+        return ""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class GapEstimate:
     """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
 
@@ -63,6 +77,6 @@ class GapEstimate:
     parallax: float = NAN
     view_count: int = 0
     translation_to_target: float = NAN
-    points: tuple[tuple[float, float, float], tuple[float, float, float]] = ((NAN,) * 3, (NAN,) * 3)
+    points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
     shares: tuple[float, float, float, float] = (NAN,) * 4
     reason: str = ""

@@ -6,12 +6,27 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_uncertainty.errors import (
+    MeasurementError,
+    ParallelToTravelError,
+    RaysMeetBehindError,
+    TravelTooShortError,
+    UnboundedError,
+)
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import gap_range
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.triangulation import triangulate
+from knee_gap_uncertainty.two_views import two_views
+
+# Why two views give no range, without the numbers: a reason that is counted must stay the same.
+REASONS: dict[type[MeasurementError], str] = {
+    TravelTooShortError: "the scope has hardly moved",
+    ParallelToTravelError: "a point lies along the scope's travel",
+    RaysMeetBehindError: "the rays to a point do not meet in front of the scope",
+    UnboundedError: "the rays to a point are parallel",
+}
 
 Floats = npt.NDArray[np.float64]
 
@@ -53,7 +68,7 @@ class Track:
         try:
             return self._measure(self._first, view, baseline)
         except MeasurementError as error:
-            return self._refuse(view, baseline, error.rule)
+            return self._refuse(view, baseline, REASONS.get(type(error), str(error)))
 
     def _measure(self, first: View, view: View, baseline: float) -> GapEstimate:
         bounds = gap_range(
@@ -66,7 +81,7 @@ class Track:
             interval=self._parameters.interval,
             apex=self._parameters.apex,
         )
-        two = triangulate(first.lens, view.lens, first.bearings, view.bearings)
+        two = triangulate(two_views(first.lens, view.lens, first.bearings, view.bearings))
         if not np.isfinite(bounds.gap_max):
             return self._refuse(view, baseline, "the admitted errors leave the gap unbounded", bounds.gap_min)
         return GapEstimate(
@@ -82,7 +97,7 @@ class Track:
             baseline=baseline,
             parallax=float(np.min(two.gamma)),
             view_count=self._view_count,
-            points=tuple(tuple(point) for point in two.points),
+            points=two.points_second,
         )
 
     def _refuse(self, view: View, baseline: float, reason: str, gap_min: float = np.nan) -> GapEstimate:

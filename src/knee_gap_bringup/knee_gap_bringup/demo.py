@@ -1,0 +1,100 @@
+"""The demo: a bag, in real time, through three live nodes over DDS, and what they said beside the truth."""
+
+import argparse
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from knee_gap_bringup.comparison import EDGES, GAP, compare
+from knee_gap_bringup.gap_plot import write_gap_plot
+from knee_gap_bringup.processes import Processes, StartError, executable
+from knee_gap_replay.bag import BagReader
+from knee_gap_replay.errors import BagError
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
+
+NODES = {
+    "segmentation_node": "knee_gap_perception",
+    "tracking_node": "knee_gap_perception",
+    "uncertainty_node": "knee_gap_uncertainty",
+}
+NAMESPACE = "/knee_gap"
+RECORDED = (EDGES, f"{NAMESPACE}/scope_pose", GAP, *(f"{GAP}/{name}" for name in ("min", "max", "snr")))
+RECORDING = "gap.mcap"
+# Time the nodes have to come up: the first start after a build compiles the kernels.
+START_TIMEOUT = 120.0
+# Time for the last image to pass through the nodes and into the recording [s].
+DRAIN = 1.0
+
+
+def play_through_nodes(bag: Path, out: Path, begin: float) -> Path:
+    """Play `bag` through the live nodes; return the recording of their output. Raises StartError."""
+    recording = out / RECORDING
+    # A domain of its own: another demo or a robot on this machine must not be heard.
+    domain = os.environ.get("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    with Processes(out, {"ROS_DOMAIN_ID": domain}) as processes:
+        processes.start("record", [executable("knee_gap_replay", "record"), str(recording), *RECORDED])
+        for node, package in NODES.items():
+            command = [executable(package, node), "--ros-args", "-r", f"__ns:={NAMESPACE}"]
+            if node == "tracking_node":
+                command += ["--params-file", str(bag / PARAMETERS_FILE)]
+            if node == "segmentation_node":
+                command += ["-p", "image_transport:=compressed"]
+            processes.start(node, command)
+        processes.wait_ready(list(NODES), START_TIMEOUT)
+        topics = [IMAGE, CAMERA_INFO, BODY_POSE]
+        # A second in which the recorder finds the nodes.
+        play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "1"]
+        processes.start("play", [*play, "--wait-for", *topics])
+        print(
+            f"demo: nodes ready after {time.monotonic() - begin:.1f} s; playing {bag.name} in real time",
+            flush=True,
+        )
+        if processes.wait("play") != 0:
+            raise StartError(f"play failed: {processes.last_words('play')}")
+        time.sleep(DRAIN)
+        for node in NODES:
+            processes.check(node)
+        if processes.end("record") != 0:
+            print(f"demo: {processes.last_words('record')}", file=sys.stderr)
+    return recording
+
+
+def run(bag: Path, out: Path) -> None:
+    """Play, record, compare and draw."""
+    begin = time.monotonic()
+    with BagReader(bag) as reader:  # refuses what is no bag before anything is started or removed
+        if missing := {IMAGE, CAMERA_INFO, BODY_POSE} - set(reader.topics):
+            raise BagError(f"{bag} has no topic {', '.join(sorted(missing))}")
+    if not (bag / PARAMETERS_FILE).is_file():
+        raise BagError(f"{bag} has no {PARAMETERS_FILE}, which says where the lens sits on the tracked body")
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out / RECORDING, ignore_errors=True)
+    recording = play_through_nodes(bag, out, begin)
+    comparison = compare(bag, recording)
+    write_gap_plot(comparison, out / "gap.png", f"knee_gap, live: {bag.name}")
+    print(f"demo: {recording} and {out / 'gap.png'} written, {time.monotonic() - begin:.1f} s in all")
+    print(f"demo: {comparison.summary()}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the demo; 0 when it ran through."""
+    parser = argparse.ArgumentParser(prog="demo", description=__doc__)
+    parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="simulated bag to play")
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
+    arguments = parser.parse_args(argv)
+    try:
+        run(arguments.bag, arguments.out)
+    except (BagError, SimulationError, StartError, OSError) as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

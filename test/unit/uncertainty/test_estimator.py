@@ -1,0 +1,196 @@
+"""The estimator: what it says of views it was given, and what it says when something is missing."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.pose_buffer import LensPose
+
+MS = 1_000_000
+FRAME_NS = 16_666_667
+POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
+TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
+TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
+
+
+def pose(stamp_ns: int, x: float, frame_id: str = "world") -> LensPose:
+    return LensPose(
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        position=np.array([x, 0.0, 0.0]),
+        quaternion_xyzw=TILT.as_quat(),
+        covariance=np.diag([1e-12] * 6),
+    )
+
+
+def edges(stamp_ns: int, x: float, track_id: int = 1, usable: bool = True) -> EdgeObservation:
+    towards = TILT.inv().apply(POINTS - [x, 0.0, 0.0])
+    bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    sigma = np.radians(0.1)
+    covariances = sigma**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
+    return EdgeObservation(stamp_ns, track_id, usable, bearings, covariances, angular_error=np.radians(0.3))
+
+
+def run(
+    estimator: GapEstimator, positions: list[float], track_id: int = 1, begin: int = 10**9
+) -> list[GapEstimate]:
+    """Images at 60 Hz with a pose 1 ms before and after each."""
+    estimates = []
+    for k, x in enumerate(positions):
+        stamp = begin + k * FRAME_NS
+        estimates += estimator.add_pose(pose(stamp - MS, x), stamp)
+        estimates += estimator.add_edges(edges(stamp, x, track_id), stamp + MS)
+        estimates += estimator.add_pose(pose(stamp + MS, x), stamp + 2 * MS)
+    return estimates
+
+
+def test_one_estimate_an_image_and_exact_for_exact_views() -> None:
+    positions = list(np.linspace(0.0, 0.006, 60))
+    estimates = run(GapEstimator(), positions)
+    assert [e.stamp_ns for e in estimates] == [10**9 + k * FRAME_NS for k in range(60)]
+    last = estimates[-1]
+    assert last.status is GapStatus.VALID
+    assert last.gap == pytest.approx(TRUE_GAP, abs=1e-9)
+    assert last.gap_min < TRUE_GAP < last.gap_max
+    assert last.baseline == pytest.approx(0.006)
+    assert last.points == pytest.approx(POINTS, abs=1e-9)
+    assert last.view_count == 60
+
+
+def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
+    estimate = run(GapEstimator(), [0.0, 0.003, 0.005])[-1]
+    first, now = edges(0, 0.0), edges(0, 0.005)
+    expected = gap_range(
+        [0, 0, 0],
+        [0.005, 0, 0],
+        TILT.apply(first.bearings),
+        TILT.apply(now.bearings),
+        angular_error=np.radians(0.3) + 3.0 * math.sqrt(3e-12),
+        translation_error=3.0 * math.sqrt(3e-12),
+        apex="best",
+    )
+    # The interpolated pose carries the bend of the path between its neighbours, about 1e-9 m here.
+    assert (estimate.gap_min, estimate.gap_max) == pytest.approx(
+        (expected.gap_min, expected.gap_max), abs=1e-6
+    )
+
+
+def test_without_travel_nothing_is_valid_and_no_gap_is_told() -> None:
+    for estimate in run(GapEstimator(), [0.0] * 30):
+        assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
+        assert math.isnan(estimate.gap)
+
+
+def test_image_waits_for_the_pose_after_it_and_is_never_extrapolated() -> None:
+    estimator = GapEstimator()
+    estimator.add_pose(pose(10**9 - MS, 0.0), 10**9)
+    assert estimator.add_edges(edges(10**9, 0.0), 10**9) == []
+    assert estimator.advance(10**9 + 15 * MS) == []
+    (estimate,) = estimator.add_pose(pose(10**9 + MS, 0.0), 10**9 + 16 * MS)
+    assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
+
+
+def test_tracking_lost_within_the_wait_and_said_once_an_image() -> None:
+    estimator = GapEstimator()
+    run(estimator, list(np.linspace(0.0, 0.006, 30)))
+    stamp = 10**9 + 30 * FRAME_NS
+    assert estimator.add_edges(edges(stamp, 0.006), stamp) == []
+    (estimate,) = estimator.advance(stamp + 21 * MS)
+    assert estimate.status is GapStatus.TRACKING_LOST
+    assert math.isnan(estimate.gap)
+    assert math.isnan(estimate.gap_min)
+    assert estimator.advance(stamp + 22 * MS) == []
+
+
+def test_poses_too_far_from_the_image_are_out_of_sync() -> None:
+    estimator = GapEstimator(EstimatorParameters(max_pose_age=0.02))
+    estimator.add_pose(pose(10**9 - 30 * MS, 0.0), 10**9)
+    estimator.add_edges(edges(10**9, 0.0), 10**9)
+    (estimate,) = estimator.add_pose(pose(10**9 + 30 * MS, 0.0), 10**9 + 10 * MS)
+    assert estimate.status is GapStatus.OUT_OF_SYNC
+
+
+def test_unusable_edges_and_silence_are_no_edges() -> None:
+    estimator = GapEstimator()
+    run(estimator, list(np.linspace(0.0, 0.006, 30)))
+    stamp = 10**9 + 30 * FRAME_NS
+    (estimate,) = estimator.add_edges(edges(stamp, 0.006, usable=False), stamp)
+    assert estimate.status is GapStatus.NO_EDGES
+    assert estimator.advance(stamp + 40 * MS) == []
+    (silence,) = estimator.advance(stamp + 60 * MS)
+    assert silence.status is GapStatus.NO_EDGES
+    assert silence.stamp_ns == stamp + 60 * MS
+    assert math.isnan(silence.gap)
+
+
+def test_another_track_starts_from_its_own_first_view() -> None:
+    estimator = GapEstimator()
+    assert run(estimator, [0.0, 0.003, 0.006])[-1].status is GapStatus.VALID
+    estimates = run(estimator, [0.006, 0.006], track_id=2, begin=2 * 10**9)
+    assert {e.status for e in estimates} == {GapStatus.INSUFFICIENT_PARALLAX}
+    assert {e.baseline for e in estimates} == {0.0}
+
+
+def test_bag_that_starts_again_keeps_nothing_of_before() -> None:
+    estimator = GapEstimator()
+    before = run(estimator, [0.0, 0.003, 0.006])
+    again = run(estimator, [0.0, 0.003, 0.006])
+    assert [e.status for e in again] == [e.status for e in before]
+    assert [e.gap for e in again] == pytest.approx([e.gap for e in before], nan_ok=True)
+    assert estimator.counts["stamps ran backwards"] == 1
+
+
+def test_other_reference_frame_ends_the_track() -> None:
+    estimator = GapEstimator()
+    run(estimator, [0.0, 0.003, 0.006])
+    stamp = 10**9 + 3 * FRAME_NS
+    estimator.add_pose(pose(stamp - MS, 0.006, "tibia"), stamp)
+    estimator.add_edges(edges(stamp, 0.006), stamp)
+    (estimate,) = estimator.add_pose(pose(stamp + MS, 0.006, "tibia"), stamp)
+    assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
+    assert estimate.frame_id == "tibia"
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 2.0, 0.0])
+def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
+    estimator = GapEstimator()
+    run(estimator, [0.0, 0.003, 0.006])
+    stamp = 10**9 + 3 * FRAME_NS
+    broken = edges(stamp, 0.006)
+    broken = replace(broken, bearings=broken.bearings * bad)
+    estimator.add_pose(pose(stamp - MS, 0.006), stamp)
+    (estimate,) = estimator.add_edges(broken, stamp)
+    assert estimate.status is not GapStatus.VALID
+    assert math.isnan(estimate.gap)
+    after = run(estimator, [0.006], begin=stamp + FRAME_NS)
+    assert after[-1].status is GapStatus.VALID
+
+
+def test_rubbish_poses_are_counted_and_not_used() -> None:
+    estimator = GapEstimator()
+    bad = replace(pose(10**9, 0.0), position=np.array([np.nan, 0.0, 0.0]))
+    assert estimator.add_pose(bad, 10**9) == []
+    assert sum(n for key, n in estimator.counts.items() if key.startswith("pose refused")) == 1
+
+
+def test_same_messages_give_same_answers() -> None:
+    positions = list(np.linspace(0.0, 0.006, 40))
+    first, second = run(GapEstimator(), positions), run(GapEstimator(), positions)
+    assert [repr(e) for e in first] == [repr(e) for e in second]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("interval", "guess"), ("apex", "third"), ("confidence_level", 1.0), ("common_share", -0.1)],
+)
+def test_settings_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(MeasurementError, match=name):
+        EstimatorParameters(**{name: value})  # type: ignore[arg-type]
