@@ -44,7 +44,7 @@ def as_ros_default(value: Any) -> Any:
 
 
 def declare(node: Any, kind: type[Parameters]) -> Parameters:
-    """Declare every field of `kind`, each with a default, on `node`; return the instance that the values make.
+    """Declare every field of `kind`, which all have defaults; return the instance that the values make.
 
     Raises:
         ConfigurationError: a value of the wrong type, outside its range or refused by the dataclass itself.
@@ -88,9 +88,10 @@ def refuse_unknown(node: Any, overrides: Iterable[str]) -> None:
 
 
 def _one_line(name: str, field: "Field[Any]", hint: object, error: Exception) -> str:
-    wanted = (
-        f"of type {getattr(hint, '__name__', hint)}" if not get_args(hint) else "a list of numbers or names"
-    )
+    if choices := field.metadata.get("choices"):
+        wanted = "one of " + ", ".join(choices)
+    else:
+        wanted = "a list" if get_origin(hint) is tuple else f"of type {getattr(hint, '__name__', hint)}"
     limits = field.metadata.get("range")
     if limits:
         wanted += f" in [{limits[0]:g}, {limits[1]:g}]"
