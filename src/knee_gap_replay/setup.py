@@ -17,6 +17,11 @@ setup(
     ],
     zip_safe=False,
     entry_points={
-        "console_scripts": [],
+        "console_scripts": [
+            "check = knee_gap_replay.check:main",
+            "play = knee_gap_replay.play_node:main",
+            "process = knee_gap_replay.process:main",
+            "record = knee_gap_replay.record_node:main",
+        ],
     },
 )

@@ -24,6 +24,9 @@ from knee_gap_replay.mcap_storage import METADATA_RECORD, ChecksummedMcap
 from knee_gap_replay.qos import PROFILES, QosName
 from knee_gap_replay.types import full_name, known_type, typestore
 
+# DDS pads what it sends; a bag written here and played and recorded again then has the same bytes.
+_DDS_ALIGNMENT = 4
+
 
 class BagMessage(NamedTuple):
     """One message of a bag, serialised; `time_ns` is when it was recorded."""
@@ -41,6 +44,7 @@ class Topic(NamedTuple):
     qos: tuple[Qos, ...]
     encoding: str
     definition: str
+    type_hash: str
 
 
 class _RosbagWriter(Writer):
@@ -108,8 +112,9 @@ class BagWriter:
     def write(self, topic: str, message: object, time_ns: int) -> None:
         """Serialise a message of `knee_gap_replay.types` and write it with its time [ns]."""
         connection = self._connection(topic)
-        data = typestore().serialize_cdr(message, connection.msgtype)
-        self._writer.write(connection, time_ns, data)
+        data = bytes(typestore().serialize_cdr(message, connection.msgtype))
+        padding = bytes(-len(data) % _DDS_ALIGNMENT)
+        self._writer.write(connection, time_ns, data + padding)
 
     def write_raw(self, topic: str, cdr_bytes: bytes | memoryview, time_ns: int) -> None:
         """Write a serialised message with its time [ns]."""
@@ -251,6 +256,7 @@ class BagReader:
                     qos=(),
                     encoding=channel.message_encoding,
                     definition=schema.data.decode(errors="replace") if schema else "",
+                    type_hash=channel.metadata.get("topic_type_hash", ""),
                 )
                 details[channel.topic] = known._replace(qos=tuple(dict.fromkeys((*known.qos, *offered))))
         return details

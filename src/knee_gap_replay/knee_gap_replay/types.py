@@ -6,8 +6,9 @@ ament index, or from this source tree where no workspace is set up.
 
 import os
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -128,3 +129,23 @@ def _blank_field(store: Typestore, node: int, value: Any) -> Any:
 
 def _numpy_type(name: str) -> "np.dtype[Any]":
     return np.dtype(name if name in _NUMPY_NAMES else _NUMPY_ALIASES[name])
+
+
+def message_class(msgtype: str) -> type:
+    """Return the Python class that ROS generated for `msgtype`; raises BagError where it is not installed."""
+    package, _, name = full_name(msgtype).partition("/msg/")
+    try:
+        return cast(type, getattr(import_module(f"{package}.msg"), name))
+    except (ImportError, AttributeError, ValueError):
+        raise BagError(f"type {msgtype} is not installed") from None
+
+
+def check_type_hash(msgtype: str, type_hash: str) -> None:
+    """Raise BagError where `type_hash` is told and is not that of the definition installed here.
+
+    Bytes of another version of a type would be read as wrong numbers.
+    """
+    if type_hash and type_hash != (here := typestore().hash_rihs01(known_type(msgtype))):
+        raise BagError(
+            f"its {msgtype} is of another version than the one installed ({type_hash}, not {here})"
+        )

@@ -1,0 +1,63 @@
+"""What the commands of this package share: one line for a user's mistake, and an orderly end by signal."""
+
+import argparse
+import logging
+import math
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+from knee_gap_node.errors import ConfigurationError
+from knee_gap_replay.errors import BagError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that tells a mistake in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the mistake and exit with 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def positive(text: str) -> float:
+    """Return a finite number above zero, for `type=` of an argument."""
+    value = not_negative(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must be greater than 0, is 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Return a finite number of at least zero, for `type=` of an argument."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
+    if not math.isfinite(value) or value < 0:
+        raise argparse.ArgumentTypeError(f"must be a finite number, 0 or more, is {text}")
+    return value
+
+
+def run(
+    parser: Parser, command: Callable[[argparse.Namespace], int], argv: Sequence[str] | None = None
+) -> int:
+    """Parse, run the command, and return its exit code; 1 and one line for a mistake."""
+    arguments = parser.parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
+    try:
+        return command(arguments)
+    except (BagError, ConfigurationError) as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def stop_on_signals() -> threading.Event:
+    """Return an event that SIGINT and SIGTERM set, so that a command can end what it does in order."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop

@@ -1,0 +1,182 @@
+"""Plays a bag onto ROS topics, byte for byte."""
+
+import argparse
+import logging
+import sys
+import threading
+import time
+from collections.abc import Collection, Sequence
+
+import rclpy
+from rclpy.clock import ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.time import Time
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+
+from knee_gap_node.parameters import refuse_unknown
+from knee_gap_replay import qos as qos_profiles
+from knee_gap_replay.bag import BagReader, Topic
+from knee_gap_replay.command_line import Parser, not_negative, positive, run, stop_on_signals
+from knee_gap_replay.errors import BagError
+from knee_gap_replay.playback import Event, Pace, Played, play_once, with_clock, without_clock
+from knee_gap_replay.types import check_type_hash, message_class
+
+_LOG = logging.getLogger(__name__)
+# Two seconds of a tracker, four of images: what a reliable subscriber may fall behind without loss. It is
+# held only while somebody is behind.
+_DEPTH = 256
+_SETTLE_SECONDS = 0.2
+_ACKNOWLEDGE_SECONDS = 2.0
+
+
+class PlayNode(Node):
+    """Publishers for the topics of a bag; skips, with one line each, what this machine has no type for."""
+
+    def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:
+        super().__init__("play")
+        refuse_unknown(self, self._parameter_overrides)
+        self._publishers_by_topic: dict[str, Publisher] = {}
+        for name in sorted(topics):
+            try:
+                self._publishers_by_topic[name] = self._publisher(name, reader.details[name])
+            except BagError as error:
+                _LOG.warning("%s is not played: %s", name, error)
+        if not self._publishers_by_topic:
+            raise BagError(f"{reader.path} has no topic that can be played here")
+        self._clock_publisher = self.create_publisher(Clock, "/clock", 10) if clock else None
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics that are played."""
+        return tuple(self._publishers_by_topic)
+
+    def emit(self, event: Event) -> None:
+        """Publish a message as it stands in the bag, or the bag's time."""
+        if event.message is not None:
+            self._publishers_by_topic[event.message.topic].publish(event.message.data)
+        elif self._clock_publisher is not None:
+            now = Time(nanoseconds=event.time_ns, clock_type=ClockType.ROS_TIME)
+            self._clock_publisher.publish(Clock(clock=now.to_msg()))
+
+    def wait_for_subscribers(self, topics: Collection[str], seconds: float, stop: threading.Event) -> None:
+        """Return once each of `topics` has a subscriber; raises BagError where one has none in time."""
+        deadline = time.monotonic() + seconds
+        while waiting := [t for t in topics if not self._publishers_by_topic[t].get_subscription_count()]:
+            if time.monotonic() > deadline:
+                raise BagError(f"nobody subscribed to {', '.join(waiting)} within {seconds:g} s")
+            if stop.wait(0.02):
+                return
+        # A match is seen on this side first; the other side needs a moment to see it too.
+        stop.wait(_SETTLE_SECONDS)
+
+    def flush(self) -> None:
+        """Return when subscribers have what was published, or cannot be waited for any longer."""
+        for publisher in self._publishers_by_topic.values():
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_SECONDS))
+        time.sleep(_SETTLE_SECONDS)
+
+    def _publisher(self, name: str, topic: Topic) -> Publisher:
+        if topic.encoding != "cdr":
+            raise BagError(f"it is serialised as '{topic.encoding}', not cdr")
+        check_type_hash(topic.msgtype, topic.type_hash)
+        try:
+            return self.create_publisher(message_class(topic.msgtype), name, _offered(topic))
+        except InvalidTopicNameException as error:
+            raise BagError(str(error).partition("\n")[0]) from None
+
+
+def _offered(topic: Topic) -> QoSProfile:
+    """Return what a replay offers: always reliable, which best-effort subscribers can use as well."""
+    latched = qos_profiles.is_latched(topic.qos)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _play(node: PlayNode, reader: BagReader, arguments: argparse.Namespace, stop: threading.Event) -> Played:
+    """Play once, or over and over, until done or stopped."""
+    begin_ns = time.monotonic_ns()
+    count = latest_ns = 0
+    while True:
+        messages = reader.messages(node.topics)
+        events = with_clock(messages) if arguments.clock else without_clock(messages)
+        pace = Pace(begin_ns, arguments.rate)
+        played = play_once(events, pace, node.emit, time.monotonic_ns, stop.wait)
+        count += played.message_count
+        latest_ns = max(latest_ns, played.latest_ns)
+        if stop.is_set() or not arguments.loop or not played.message_count:
+            return Played(count, latest_ns, played.end_ns)
+        begin_ns = played.end_ns
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    with BagReader(arguments.bag) as reader:
+        chosen = frozenset(arguments.topics or reader.topics)
+        reader.messages([*chosen, *arguments.wait_for])  # refuses a topic that the bag does not have
+        stop = stop_on_signals()
+        node = PlayNode(reader, chosen, clock=arguments.clock)
+        try:
+            if unplayed := sorted(set(arguments.wait_for) - set(node.topics)):
+                raise BagError(f"--wait-for {', '.join(unplayed)}: not played")
+            node.wait_for_subscribers(arguments.wait_for, arguments.wait_timeout, stop)
+            begin = time.monotonic()
+            if not stop.wait(arguments.delay):
+                played = _play(node, reader, arguments, stop)
+                seconds = time.monotonic() - begin - arguments.delay
+                print(
+                    f"play: {played.message_count} messages of {len(node.topics)} topics in {seconds:.1f} s, "
+                    f"at most {played.latest_ns * 1e-6:.1f} ms late",
+                    flush=True,
+                )
+                node.flush()
+        finally:
+            node.destroy_node()
+    return 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="play", description=__doc__)
+    parser.add_argument("bag", metavar="BAG", help="bag folder or .mcap file")
+    parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="times as fast as recorded")
+    parser.add_argument(
+        "--loop", action="store_true", help="begin again at the end; header stamps then jump back"
+    )
+    parser.add_argument("--clock", action="store_true", help="publish the bag's time on /clock, at 100 Hz")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play these only")
+    parser.add_argument(
+        "--delay", type=not_negative, default=0.0, metavar="SECONDS", help="wait before the first"
+    )
+    parser.add_argument(
+        "--wait-for", nargs="+", default=[], metavar="TOPIC", help="begin when each of these has a subscriber"
+    )
+    parser.add_argument(
+        "--wait-timeout", type=positive, default=30.0, metavar="SECONDS", help="how long --wait-for waits"
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Play a bag; ROS arguments (--ros-args) are understood as by any node."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    try:
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy's own exceptions for wrong ROS arguments are not public
+        print(f"play: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 2
+    try:
+        return run(_parser(), _run, remove_ros_args(["play", *given])[1:])
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,181 @@
+"""Records ROS topics into a bag, byte for byte."""
+
+import argparse
+import logging
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import rclpy
+from rclpy.clock import ROSClock
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import remove_ros_args
+from rosbags.interfaces import Qos, QosDurability, QosReliability
+
+from knee_gap_node.parameters import refuse_unknown
+from knee_gap_replay.bag import BagMessage, BagWriter
+from knee_gap_replay.command_line import Parser, positive, run, stop_on_signals
+from knee_gap_replay.errors import BagError
+from knee_gap_replay.qos import PROFILES
+from knee_gap_replay.recording import WriterThread
+from knee_gap_replay.types import known_type, message_class
+
+_LOG = logging.getLogger(__name__)
+# One second of a tracker at 240 Hz, four of images: how long a busy machine may keep the recorder away.
+_DEPTH = 256
+_LOOK_SECONDS = 0.02
+
+
+class RecordNode(Node):
+    """Subscribes to each topic once somebody publishes it, as weakly as its weakest publisher offers."""
+
+    def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
+        super().__init__("record")
+        refuse_unknown(self, self._parameter_overrides)
+        self._writer = writer
+        self._wanted = [self.resolve_topic_name(topic) for topic in dict.fromkeys(topics)]
+        self._refused: set[str] = set()
+        self._subscriptions_by_topic: dict[str, Subscription] = {}
+        self._profiles: dict[str, QoSProfile] = {}
+        self._last_numbers: dict[str, int] = {}
+        self.lost: Counter[str] = Counter()
+        self.create_timer(_LOOK_SECONDS, self.look_for_publishers)
+        self.look_for_publishers()
+
+    @property
+    def silent_topics(self) -> list[str]:
+        """Topics that nobody has published so far."""
+        return [topic for topic in self._wanted if topic not in self._last_numbers]
+
+    def look_for_publishers(self) -> None:
+        """Subscribe to what has appeared; anew where a publisher offers less than the ones before."""
+        for topic in self._wanted:
+            publishers = self.get_publishers_info_by_topic(topic)
+            if not publishers or topic in self._refused:
+                continue
+            profile = _weakest(publishers)
+            if (known := self._profiles.get(topic)) is not None:
+                if known == profile or known.reliability == ReliabilityPolicy.BEST_EFFORT:
+                    continue
+                _LOG.warning("%s has a publisher that offers less than the others; subscribing anew", topic)
+                self.destroy_subscription(self._subscriptions_by_topic[topic])
+            try:
+                self._subscribe(topic, publishers, profile)
+            except BagError as error:
+                self._refused.add(topic)
+                _LOG.warning("%s is not recorded: %s", topic, error)
+
+    def _subscribe(self, topic: str, publishers: Sequence[TopicEndpointInfo], profile: QoSProfile) -> None:
+        msgtype = known_type(publishers[0].topic_type)
+        kind = message_class(msgtype)
+        self._writer.add_topic(topic, msgtype, [_offered(publisher) for publisher in publishers])
+        self._profiles[topic] = profile
+        self._subscriptions_by_topic[topic] = self.create_subscription(
+            kind, topic, partial(self._keep, topic, msgtype), profile, raw=True
+        )
+
+    def _keep(self, topic: str, msgtype: str, data: bytes, info: Mapping[str, int | None]) -> None:
+        self._count_lost(topic, info.get("publication_sequence_number"))
+        received = info.get("received_timestamp")
+        clock = self.get_clock()
+        if received is None or (isinstance(clock, ROSClock) and clock.ros_time_is_active):
+            received = clock.now().nanoseconds
+        self._writer.put(BagMessage(topic, msgtype, received, data))
+
+    def _count_lost(self, topic: str, number: int | None) -> None:
+        """Count the numbers left out by a topic's only publisher; several publishers each have their own."""
+        if number is None:
+            return
+        last = self._last_numbers.get(topic)
+        if last is not None and number > last + 1 and self.count_publishers(topic) == 1:
+            self.lost[topic] += number - last - 1
+        self._last_numbers[topic] = number
+
+
+def _weakest(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """Return the strongest request that every publisher satisfies."""
+    reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _offered(publisher: TopicEndpointInfo) -> Qos:
+    """Return what a publisher offers, for the bag; the depth of its history is not told over the network."""
+    profile = publisher.qos_profile
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    reliable = profile.reliability == ReliabilityPolicy.RELIABLE
+    return PROFILES["latched" if latched else "reliable"]._replace(
+        reliability=QosReliability.RELIABLE if reliable else QosReliability.BEST_EFFORT,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+    )
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    stop = stop_on_signals()
+    with BagWriter(arguments.out) as bag:
+        writer = WriterThread(bag)
+        writer.start()
+        node = RecordNode(arguments.topics, writer)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        end = time.monotonic() + (arguments.duration or float("inf"))
+        try:
+            while not stop.is_set() and time.monotonic() < end and writer.error is None:
+                executor.spin_once(timeout_sec=0.05)
+        finally:
+            writer.finish()
+            node.destroy_node()
+        return _report(node, writer, bag, arguments.out)
+
+
+def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) -> int:
+    if writer.error is not None:
+        raise BagError(f"{out}: {writer.error}")
+    counts = bag.counts
+    for topic in node.silent_topics:
+        _LOG.warning("nothing was received on %s", topic)
+    lost = node.lost + writer.dropped
+    for topic, count in sorted(lost.items()):
+        _LOG.warning("%d messages of %s were lost", count, topic)
+    print(f"record: {sum(counts.values())} messages of {len(counts)} topics in {out}", flush=True)
+    return 1 if lost else 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="record", description=__doc__)
+    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument(
+        "topics", nargs="+", metavar="TOPIC", help="topics to record, once they are published"
+    )
+    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="stop after so long")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Record topics until SIGINT or SIGTERM; ROS arguments (--ros-args) are understood as by any node."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    try:
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy's parser raises several unrelated kinds for a bad --ros-args
+        print(f"record: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    try:
+        return run(_parser(), _run, remove_ros_args(["record", *given])[1:])
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

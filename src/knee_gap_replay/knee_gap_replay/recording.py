@@ -1,0 +1,77 @@
+"""Writes a bag beside the thread that receives, so that a slow disk delays no message."""
+
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from rosbags.interfaces import Qos
+
+from knee_gap_replay.bag import BagMessage, BagWriter
+
+# How much a recorder that is killed loses at most.
+_FLUSH_SECONDS = 0.5
+# Some seconds of raw video.
+_MEMORY_BYTES = 512 * 1024 * 1024
+
+
+class WriterThread(threading.Thread):
+    """Takes messages without waiting and writes them in the order in which they came.
+
+    A message that comes while the memory for waiting ones is full is dropped and counted in `dropped`. A
+    failure to write ends the thread and stands in `error`.
+    """
+
+    def __init__(self, bag: BagWriter, memory_bytes: int = _MEMORY_BYTES) -> None:
+        super().__init__(name="bag writer", daemon=True)
+        self.dropped: Counter[str] = Counter()
+        self.error: Exception | None = None
+        self._bag = bag
+        self._memory_bytes = memory_bytes
+        self._put_bytes = self._written_bytes = 0
+        self._queue: queue.SimpleQueue[BagMessage | tuple[str, str, Sequence[Qos]] | None] = (
+            queue.SimpleQueue()
+        )
+
+    def add_topic(self, name: str, msgtype: str, qos: Sequence[Qos]) -> None:
+        """Announce a topic, before its messages."""
+        self._queue.put((name, msgtype, qos))
+
+    def put(self, message: BagMessage) -> None:
+        """Take a message; returns at once."""
+        if self._put_bytes - self._written_bytes + len(message.data) > self._memory_bytes:
+            self.dropped[message.topic] += 1
+            return
+        self._put_bytes += len(message.data)
+        self._queue.put(message)
+
+    def finish(self) -> None:
+        """Return when everything taken is written."""
+        self._queue.put(None)
+        self.join()
+
+    def run(self) -> None:
+        """Write until `finish`."""
+        try:
+            self._write()
+        except Exception as error:  # told by the command, which then stops
+            self.error = error
+
+    def _write(self) -> None:
+        flushed = time.monotonic()
+        while True:
+            try:
+                item = self._queue.get(timeout=_FLUSH_SECONDS)
+            except queue.Empty:
+                item = ("", "", ())
+            if item is None:
+                return
+            if isinstance(item, BagMessage):
+                self._bag.write_raw(item.topic, item.data, item.time_ns)
+                self._written_bytes += len(item.data)
+            elif item[0]:
+                self._bag.add_topic(*item)
+            if time.monotonic() - flushed > _FLUSH_SECONDS:
+                self._bag.flush()
+                flushed = time.monotonic()
