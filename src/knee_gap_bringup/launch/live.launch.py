@@ -1,0 +1,49 @@
+"""The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`."""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+SHARE = Path(get_package_share_directory("knee_gap_bringup"))
+CONFIG = SHARE / "config"
+TRANSPORT = SHARE / "launch" / "transport.launch.py"
+NODES = {
+    "segmentation_node": "knee_gap_perception",
+    "tracking_node": "knee_gap_perception",
+    "uncertainty_node": "knee_gap_uncertainty",
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Three nodes in one namespace, with one parameter file."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("params", default_value=str(CONFIG / "knee_gap.yaml")),
+            DeclareLaunchArgument("namespace", default_value="knee_gap"),
+            DeclareLaunchArgument("image_transport", default_value="raw", choices=["raw", "compressed"]),
+            IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
+            *(
+                Node(
+                    package=package,
+                    executable=name,
+                    name=name,
+                    namespace=LaunchConfiguration("namespace"),
+                    parameters=[
+                        LaunchConfiguration("params"),
+                        *(
+                            [{"image_transport": LaunchConfiguration("image_transport")}]
+                            if name == "segmentation_node"
+                            else []
+                        ),
+                    ],
+                    output="screen",
+                )
+                for name, package in NODES.items()
+            ),
+        ]
+    )

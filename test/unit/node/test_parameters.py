@@ -1,0 +1,95 @@
+"""Parameters declared from a dataclass, against a stand-in for the node."""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rcl_interfaces")
+
+from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.parameters import declare, refuse_unknown
+
+
+@dataclass(frozen=True)
+class Settings:
+    rate: float = field(default=60.0, metadata={"description": "rate [Hz]", "range": (1.0, 240.0)})
+    count: int = field(default=3, metadata={"description": "count [-]", "range": (1, 10)})
+    source: str = field(default="raw", metadata={"description": "source", "choices": ("raw", "compressed")})
+    offset: tuple[float, ...] = field(default=(0.0, 0.0), metadata={"description": "offset [m]"})
+    limit: float = field(
+        default=float("nan"), metadata={"description": "limit [m]", "range": (0.0, 1.0), "nan": True}
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.offset) != 2:
+            raise ValueError(f"offset must have 2 numbers, not {len(self.offset)}")
+
+
+class StandIn:
+    """What `declare` uses of a node, with the range check that rclpy does."""
+
+    def __init__(self, **given: Any) -> None:
+        self.given = given
+        self._parameters: dict[str, Any] = {}
+        self.descriptors: dict[str, Any] = {}
+
+    def declare_parameter(self, name: str, default: Any, descriptor: Any) -> Any:
+        value = self.given.get(name, default)
+        if type(value) is not type(default):
+            raise TypeError("wrong type")
+        for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
+            if not limits.from_value <= value <= limits.to_value:
+                raise ValueError("out of range")
+        self._parameters[name] = value
+        self.descriptors[name] = descriptor
+        return SimpleNamespace(value=value)
+
+    def has_parameter(self, name: str) -> bool:
+        return name in self._parameters
+
+
+def test_defaults_stand_in_one_place() -> None:
+    declared = declare(StandIn(), Settings)
+    assert (declared.rate, declared.count, declared.source, declared.offset) == (60.0, 3, "raw", (0.0, 0.0))
+
+
+def test_given_values_reach_the_dataclass() -> None:
+    declared = declare(StandIn(rate=120.0, source="compressed", offset=[1.0, 2.0]), Settings)
+    assert (declared.rate, declared.source, declared.offset) == (120.0, "compressed", (1.0, 2.0))
+
+
+def test_descriptors_tell_meaning_range_and_that_they_are_fixed() -> None:
+    node = StandIn()
+    declare(node, Settings)
+    assert node.descriptors["rate"].description == "rate [Hz]"
+    assert node.descriptors["rate"].floating_point_range[0].to_value == 240.0
+    assert node.descriptors["count"].integer_range[0].from_value == 1
+    assert "raw, compressed" in node.descriptors["source"].additional_constraints
+    assert "NaN" in node.descriptors["limit"].additional_constraints
+    assert all(descriptor.read_only for descriptor in node.descriptors.values())
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"rate": 0.0}, r"rate: must be of type float in \[1, 240\]"),
+        ({"rate": "fast"}, "rate: must be of type float"),
+        ({"count": 11}, r"count: must be of type int in \[1, 10\]"),
+        ({"source": "guess"}, "source is 'guess'; it is one of: raw, compressed"),
+        ({"offset": [1.0]}, "offset must have 2 numbers, not 1"),
+    ],
+)
+def test_bad_values_are_refused_in_one_line(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words) as refusal:
+        declare(StandIn(**given), Settings)
+    assert "\n" not in str(refusal.value)
+
+
+def test_misspelt_name_is_refused_with_the_names_there_are() -> None:
+    node = StandIn()
+    declare(node, Settings)
+    refuse_unknown(node, ["rate", "use_sim_time"])
+    with pytest.raises(ConfigurationError, match="no parameter ratte; there are: count, limit, offset, rate"):
+        refuse_unknown(node, ["ratte"])
