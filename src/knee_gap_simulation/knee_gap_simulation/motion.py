@@ -1,0 +1,120 @@
+"""How a hand moves the scope: smooth travel, physiological tremor, slow drift and small turns."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.rigid import FloatArray, from_parts, transform
+
+
+class TravelDirection(StrEnum):
+    """Where the scope travels, seen from the gap: along it, across it, or towards it."""
+
+    ALONG = "along"
+    ACROSS = "across"
+    FORWARD = "forward"
+
+    @property
+    def axis(self) -> int:
+        """Axis of the scene frame (x along the gap, y across it, z away from the lens)."""
+        return {TravelDirection.ALONG: 0, TravelDirection.ACROSS: 1, TravelDirection.FORWARD: 2}[self]
+
+
+def minimum_jerk(phase: npt.ArrayLike) -> FloatArray:
+    """Position in [0, 1] of a minimum-jerk reach at a phase, clipped to [0, 1] (Flash and Hogan, 1985)."""
+    s = np.clip(np.asarray(phase, dtype=np.float64), 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """Size of a hand's movements. Lengths [m] and angles [rad] are RMS lengths of the vectors."""
+
+    still_s: float = 0.3
+    reach_s: float = 2.5
+    rest_s: float = 0.2
+    tremor: float = 0.05e-3
+    tremor_turn: float = np.radians(0.03)
+    drift: float = 0.12e-3
+    drift_turn: float = np.radians(0.5)
+    pivot_turn: float = np.radians(2.5)  # turn of the scope about the portal over the whole travel
+
+
+class HandMotion:
+    """Lens poses over time: ``T_scene_lens`` as a smooth function, exact at any time.
+
+    The lens looks along the scene's z from ``depth`` in front of the gap, its picture turned by ``roll``.
+    After a still start it reaches over ``travel`` and back, again and again. The same seed gives the same
+    motion.
+    """
+
+    def __init__(
+        self,
+        *,
+        travel: float,
+        depth: float,
+        direction: TravelDirection = TravelDirection.ALONG,
+        roll: float = np.radians(9.0),
+        pitch: float = 0.0,
+        offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        hand: Hand | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not 0.0 <= travel <= 0.05:
+            raise SimulationError(f"travel must lie in [0, 0.05] m, not {travel}")
+        if not 0.002 <= depth <= 0.05:
+            raise SimulationError(f"depth must lie in [0.002, 0.05] m, not {depth}")
+        self._travel, self._depth, self._axis = travel, depth, direction.axis
+        self._hand = hand or Hand()
+        self._offset = np.asarray(offset, dtype=np.float64)
+        view = transform([pitch, 0.0, 0.0], np.zeros(3)) @ transform([0.0, 0.0, roll], np.zeros(3))
+        self._base_rotation = view[:3, :3]
+        rng = np.random.default_rng([seed, 0x4841])
+        self._tremor = _Wander(rng, self._hand.tremor, (8.0, 12.0), waves=5)
+        self._tremor_turn = _Wander(rng, self._hand.tremor_turn, (8.0, 12.0), waves=5)
+        self._drift = _Wander(rng, self._hand.drift, (0.05, 0.35), waves=3)
+        self._drift_turn = _Wander(rng, self._hand.drift_turn, (0.05, 0.35), waves=3)
+
+    def travelled(self, time_s: npt.ArrayLike) -> FloatArray:
+        """Share of the travel, in [0, 1], that the reach alone has covered at times [s]."""
+        hand = self._hand
+        stroke = hand.reach_s + hand.rest_s
+        since = np.maximum(np.asarray(time_s, dtype=np.float64) - hand.still_s, 0.0)
+        strokes = np.floor(since / stroke)
+        reach = minimum_jerk((since - strokes * stroke) / hand.reach_s)
+        return np.where(strokes % 2 == 0, reach, 1.0 - reach)
+
+    def poses(self, time_s: npt.ArrayLike) -> FloatArray:
+        """``T_scene_lens`` (..., 4, 4) at times (...) [s]."""
+        time = np.asarray(time_s, dtype=np.float64)
+        reached = self.travelled(time) - (1.0 if self._axis == 2 else 0.5)
+        position = self._tremor(time) + self._drift(time) + self._offset
+        position[..., 2] -= self._depth
+        position[..., self._axis] += self._travel * reached
+        turn = self._tremor_turn(time) + self._drift_turn(time)
+        # A scope pivots about its portal: moving the lens to one side turns the view to the other.
+        if self._axis == 0:
+            turn[..., 1] -= self._hand.pivot_turn * reached
+        elif self._axis == 1:
+            turn[..., 0] += self._hand.pivot_turn * reached
+        rotation = transform(turn, np.zeros(3))[..., :3, :3] @ self._base_rotation
+        return from_parts(rotation, position)
+
+
+class _Wander:
+    """A smooth vector process: a few sine waves an axis, zero at time 0."""
+
+    def __init__(
+        self, rng: np.random.Generator, rms: float, band_hz: tuple[float, float], waves: int
+    ) -> None:
+        self._frequency = 2.0 * np.pi * rng.uniform(*band_hz, size=(waves, 3))
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, size=(waves, 3))
+        self._amplitude = rms * np.sqrt(2.0 / (3.0 * waves))
+
+    def __call__(self, time: FloatArray) -> FloatArray:
+        angle = time[..., None, None] * self._frequency + self._phase
+        wave: FloatArray = self._amplitude * (np.sin(angle) - np.sin(self._phase)).sum(axis=-2)
+        return wave
