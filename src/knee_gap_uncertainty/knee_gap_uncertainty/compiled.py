@@ -1,5 +1,6 @@
 """Compiling the numerical kernels, with a cache on disk that follows every kernel's source."""
 
+import re
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
@@ -8,16 +9,26 @@ from typing import Any
 
 import numba
 
-MARK = "@compiled"
 # What `fastmath` lets the compiler assume: no NaN, and sums in any order. Infinities stay infinities.
 FAST = {"nnan", "nsz", "reassoc", "contract"}
 
+IMPORTED = re.compile(r"^from knee_gap_uncertainty\.(\w+) import", re.MULTILINE)
+
 
 @cache
-def sources_digest() -> str:
-    """Digest of all modules of this package that hold compiled functions."""
-    sources = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
-    return sha256(b"".join(source for source in sources if MARK.encode() in source)).hexdigest()[:12]
+def sources(module: str) -> frozenset[Path]:
+    """Source files of a module of this package and of all those of this package it is built on."""
+    path = Path(__file__).with_name(f"{module}.py")
+    found = {path}
+    for imported in IMPORTED.findall(path.read_text(encoding="utf-8")):
+        found |= sources(imported)
+    return frozenset(found)
+
+
+@cache
+def sources_digest(module: str) -> str:
+    """Digest of everything that the compiled functions of a module of this package are made from."""
+    return sha256(b"".join(path.read_bytes() for path in sorted(sources(module)))).hexdigest()[:12]
 
 
 def compiled(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Any:
@@ -29,7 +40,7 @@ def compiled(function: Callable[..., Any] | None = None, *, fastmath: bool = Fal
     """
     if function is None:
         return lambda decorated: compiled(decorated, fastmath=fastmath)
-    function.__qualname__ += f"_{sources_digest()}"
+    function.__qualname__ += f"_{sources_digest(Path(function.__code__.co_filename).stem)}"
     options: dict[str, Any] = {"error_model": "numpy", "fastmath": FAST if fastmath else False}
     try:
         return numba.njit(cache=True, **options)(function)

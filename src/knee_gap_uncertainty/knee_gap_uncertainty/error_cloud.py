@@ -14,10 +14,11 @@ import numpy.typing as npt
 from knee_gap_uncertainty.angle_sets import SIGNS, Signs, perturbed_angles
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.errors import ParallelToTravelError
+from knee_gap_uncertainty.slices import places_by_inverse
 from knee_gap_uncertainty.translation_volume import displaced_travel, displacements
 from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE, ray_length, triangle_angles
 from knee_gap_uncertainty.two_views import TwoViews
-from knee_gap_uncertainty.vectors import Vector, add, cross, norm, scale, unit
+from knee_gap_uncertainty.vectors import Vector, add, cross, norm, row, scale, unit, vector
 
 Apex: TypeAlias = Literal["first", "second"]
 
@@ -34,17 +35,80 @@ FAR = 1e3
 
 
 class ErrorCloud(NamedTuple):
-    """Points around one end of the gap.
+    """Points around one end of the gap, in rings about the ray; coordinates [m], apex at the origin.
 
-    `points` (3, 8, rings): coordinates, spokes, rings [m], apex at the origin. `lengths` (rings,): L' of each
-    ring [m]. Only the first `bounded` rings are places where the point may be; the others stand for rays that
-    do not meet. `smallest_angle`: least angle alpha' or beta' among all [rad]; a negative one is none.
+    `points` (3, 8, rings): coordinates, spokes, rings, coarsely in order of length; `starts`: where the
+    slices of each spoke begin, with the end of the last. `far` (3, 8, more): rings for rays that do not meet,
+    drawn at a great distance. `smallest_angle`: least angle alpha', beta' or pi less one of them [rad]; not
+    above zero where there is no triangle.
     """
 
     points: npt.NDArray[np.float64]
-    lengths: npt.NDArray[np.float64]
-    bounded: int
+    starts: npt.NDArray[np.int64]
+    far: npt.NDArray[np.float64]
     smallest_angle: float
+
+
+@compiled
+def trace_cloud(
+    travel: Vector,
+    own: Vector,
+    other: Vector,
+    angular_error: float,
+    shifts: npt.NDArray[np.float64],
+    signs: npt.NDArray[np.float64],
+) -> ErrorCloud:
+    """Cloud about the end of the ray `own`, for all `shifts` of both lenses and all rows of `signs`.
+
+    `travel` leads from the ray's own lens to the other one; `other` is the bearing from there.
+    """
+    lengths, smallest_angle = ring_lengths(travel, own, other, angular_error, shifts, signs)
+    places, starts = places_by_inverse(lengths[lengths < math.inf])
+    points = np.empty((3, SPOKES, places.size))
+    far = np.empty((3, SPOKES, lengths.size - places.size))
+    ring, drawn = 0, 0
+    for p in range(shifts.shape[0]):
+        apex = row(shifts, p)
+        for q in range(shifts.shape[0]):
+            displaced = displaced_travel(travel, apex, row(shifts, q))
+            across = unit(cross(own, cross(displaced, own)))
+            for _ in range(signs.shape[0]):
+                length = lengths[ring]
+                if length < math.inf:
+                    draw_ring(points, places[drawn], apex, own, across, length, angular_error)
+                    drawn += 1
+                else:
+                    draw_ring(far, ring - drawn, apex, own, across, FAR * norm(travel), angular_error)
+                ring += 1
+    return ErrorCloud(points, starts, far, smallest_angle)
+
+
+@compiled
+def ring_lengths(
+    travel: Vector,
+    own: Vector,
+    other: Vector,
+    angular_error: float,
+    shifts: npt.NDArray[np.float64],
+    signs: npt.NDArray[np.float64],
+) -> tuple[npt.NDArray[np.float64], float]:
+    """L' of every ring by (8), infinite where alpha' + beta' reaches pi [m], and the smallest angle [rad]."""
+    lengths = np.empty(shifts.shape[0] ** 2 * signs.shape[0])
+    smallest_angle = math.inf
+    ring = 0
+    for p in range(shifts.shape[0]):
+        for q in range(shifts.shape[0]):
+            displaced = displaced_travel(travel, row(shifts, p), row(shifts, q))
+            distance = norm(displaced)
+            angles = triangle_angles(displaced, own, other)
+            smallest_angle = min(smallest_angle, math.pi - max(angles))
+            for k in range(signs.shape[0]):
+                own_angle, other_angle = perturbed_angles(angles, signs[k], angular_error)
+                smallest_angle = min(smallest_angle, own_angle, other_angle)
+                meet = own_angle + other_angle < math.pi
+                lengths[ring] = ray_length(distance, own_angle, other_angle) if meet else math.inf
+                ring += 1
+    return lengths, smallest_angle
 
 
 @compiled
@@ -72,46 +136,6 @@ def draw_ring(
             points[axis, 2 * i + 1, ring] = centre[axis] - spoke[axis]
 
 
-@compiled
-def trace_cloud(
-    travel: Vector,
-    own: Vector,
-    other: Vector,
-    angular_error: float,
-    shifts: npt.NDArray[np.float64],
-    signs: npt.NDArray[np.float64],
-) -> ErrorCloud:
-    """Cloud about the end of the ray `own`, for all `shifts` of both lenses and all rows of `signs`.
-
-    `travel` leads from the ray's own lens to the other one; `other` is the bearing from there.
-    """
-    rings = shifts.shape[0] ** 2 * signs.shape[0]
-    points = np.empty((3, SPOKES, rings))
-    lengths = np.empty(rings)
-    smallest_angle = math.inf
-    bounded, unbounded = 0, rings
-    for p in range(shifts.shape[0]):
-        apex = (shifts[p, 0], shifts[p, 1], shifts[p, 2])
-        for q in range(shifts.shape[0]):
-            displaced = displaced_travel(travel, apex, (shifts[q, 0], shifts[q, 1], shifts[q, 2]))
-            distance = norm(displaced)
-            angles = triangle_angles(displaced, own, other)
-            across = unit(cross(own, cross(displaced, own)))
-            smallest_angle = min(smallest_angle, math.pi - max(angles))
-            for k in range(signs.shape[0]):
-                own_angle, other_angle = perturbed_angles(angles, signs[k], angular_error)
-                smallest_angle = min(smallest_angle, own_angle, other_angle)
-                if own_angle + other_angle < math.pi:
-                    ring, length = bounded, ray_length(distance, own_angle, other_angle)
-                    bounded += 1
-                else:
-                    unbounded -= 1
-                    ring, length = unbounded, FAR * distance
-                lengths[ring] = length
-                draw_ring(points, ring, apex, own, across, length, angular_error)
-    return ErrorCloud(points, lengths, bounded, smallest_angle)
-
-
 def error_clouds(
     views: TwoViews,
     *,
@@ -127,17 +151,15 @@ def error_clouds(
     bearing into the direction of travel.
     """
     first = apex == "first"
-    travel = tuple(views.travel if first else -views.travel)
+    travel = vector(views.travel if first else -views.travel)
     lens = views.lens_0 if first else views.lens_1
     own, other = (views.bearings_0, views.bearings_1) if first else (views.bearings_1, views.bearings_0)
     shifts = displacements(translation_error, radii)
     clouds = []
     for n in range(2):
-        cloud = ErrorCloud(
-            *trace_cloud(travel, tuple(own[n]), tuple(other[n]), angular_error, shifts, SIGNS[signs])
-        )
+        cloud = trace_cloud(travel, row(own, n), row(other, n), angular_error, shifts, SIGNS[signs])
         refuse_parallel(cloud.smallest_angle)
-        clouds.append(lens + cloud.points[:, :, : cloud.bounded].reshape(3, -1).T)
+        clouds.append(lens + cloud.points.reshape(3, -1).T)
     return clouds[0], clouds[1]
 
 

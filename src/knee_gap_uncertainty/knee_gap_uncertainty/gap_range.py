@@ -10,12 +10,13 @@ from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS, Interval
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.error_cloud import refuse_parallel, trace_cloud
 from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
-from knee_gap_uncertainty.extremes import extremes, slice_cloud
+from knee_gap_uncertainty.extremes import extremes
 from knee_gap_uncertainty.overlap import hulls_meet
+from knee_gap_uncertainty.slices import slice_spokes
 from knee_gap_uncertainty.translation_volume import displacements
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import TwoViews, two_views
-from knee_gap_uncertainty.vectors import subtract
+from knee_gap_uncertainty.vectors import row, subtract, vector
 
 LARGEST_ANGULAR_ERROR = math.pi / 2
 # The clouds grow with the square of the radii: 30 hold four million points each.
@@ -112,20 +113,24 @@ def cloud_range(
 
     `travel` (3,) leads from the lens with the bearings `own` (2, 3) to the one with `other` (2, 3).
     """
-    t = (travel[0], travel[1], travel[2])
-    own_0, own_1 = (own[0, 0], own[0, 1], own[0, 2]), (own[1, 0], own[1, 1], own[1, 2])
-    cloud_0 = trace_cloud(t, own_0, (other[0, 0], other[0, 1], other[0, 2]), angular_error, shifts, signs)
-    cloud_1 = trace_cloud(t, own_1, (other[1, 0], other[1, 1], other[1, 2]), angular_error, shifts, signs)
+    t = vector(travel)
+    cloud_0 = trace_cloud(t, row(own, 0), row(other, 0), angular_error, shifts, signs)
+    cloud_1 = trace_cloud(t, row(own, 1), row(other, 1), angular_error, shifts, signs)
     smallest_angle = min(cloud_0.smallest_angle, cloud_1.smallest_angle)
     if not smallest_angle > 0.0:
         return math.nan, math.nan, smallest_angle
-    nearest, farthest = extremes(
-        slice_cloud(cloud_0.points[:, :, : cloud_0.bounded], cloud_0.lengths[: cloud_0.bounded]),
-        slice_cloud(cloud_1.points[:, :, : cloud_1.bounded], cloud_1.lengths[: cloud_1.bounded]),
+    one, other_one = (
+        slice_spokes(cloud_0.points, cloud_0.starts),
+        slice_spokes(cloud_1.points, cloud_1.starts),
     )
-    if hulls_meet(cloud_0.points.reshape(3, -1), cloud_1.points.reshape(3, -1), subtract(own_0, own_1)):
+    far_0, far_1 = (
+        cloud_0.far.reshape(3, cloud_0.far.size // 3),
+        cloud_1.far.reshape(3, cloud_1.far.size // 3),
+    )
+    nearest, farthest = extremes(one, other_one)
+    if hulls_meet(one, far_0, other_one, far_1, subtract(row(own, 0), row(own, 1))):
         nearest = 0.0
-    if cloud_0.bounded < cloud_0.lengths.size or cloud_1.bounded < cloud_1.lengths.size:
+    if far_0.size + far_1.size > 0:
         farthest = math.inf
     return nearest, farthest, smallest_angle
 

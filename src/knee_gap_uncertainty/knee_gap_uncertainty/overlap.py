@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.compiled import compiled
-from knee_gap_uncertainty.vectors import Vector, add, cross, dot, norm, scale, subtract
+from knee_gap_uncertainty.slices import SlicedCloud
+from knee_gap_uncertainty.vectors import Vector, add, column, cross, dot, norm, row, scale, subtract
 
 # Hulls closer than this share of their extent touch. The search takes about ten steps; one that does not end,
 # because the hulls very nearly touch, is decided the safe way.
@@ -21,8 +22,14 @@ MOST_STEPS = 100
 
 
 @compiled
-def hulls_meet(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], guess: Vector) -> bool:
-    """Whether the convex hulls of two clouds (3, n) and (3, m) have a point in common.
+def hulls_meet(
+    one: SlicedCloud,
+    one_far: npt.NDArray[np.float64],
+    other: SlicedCloud,
+    other_far: npt.NDArray[np.float64],
+    guess: Vector,
+) -> bool:
+    """Whether the convex hulls of two clouds, each with its far points (3, n), have a point in common.
 
     `guess` is a direction from the other cloud to this one, tried first as normal of a plane between them.
     """
@@ -31,23 +38,44 @@ def hulls_meet(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64], gue
     closest = guess
     extent = 0.0
     for _ in range(MOST_STEPS):
-        corner = subtract(extreme_point(one, scale(-1.0, closest)), extreme_point(other, closest))
+        corner = subtract(
+            extreme_point(one, one_far, scale(-1.0, closest)), extreme_point(other, other_far, closest)
+        )
         extent = max(extent, norm(corner))
         if dot(closest, corner) > TOUCHING * extent * norm(closest):
             return False
-        simplex[count] = corner
+        simplex[count, 0], simplex[count, 1], simplex[count, 2] = corner
         count, closest = closest_of_simplex(simplex, count + 1)
         if norm(closest) <= TOUCHING * extent:
             return True
     return True
 
 
-@compiled(fastmath=True)
-def extreme_point(points: npt.NDArray[np.float64], direction: Vector) -> Vector:
-    """Column that lies farthest in the direction."""
-    along = direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2]
-    chosen = along.argmax()
-    return points[0, chosen], points[1, chosen], points[2, chosen]
+@compiled
+def extreme_point(cloud: SlicedCloud, far: npt.NDArray[np.float64], direction: Vector) -> Vector:
+    """Point of the cloud, or of its far points, that lies farthest in the direction."""
+    best = -math.inf
+    found = (0.0, 0.0, 0.0)
+    for i in range(cloud.starts.size - 1):
+        if reach(cloud.low, cloud.high, i, direction) > best:
+            for j in range(cloud.starts[i], cloud.starts[i + 1]):
+                point = column(cloud.points, j)
+                if dot(point, direction) > best:
+                    best, found = dot(point, direction), point
+    for j in range(far.shape[1]):
+        point = column(far, j)
+        if dot(point, direction) > best:
+            best, found = dot(point, direction), point
+    return found
+
+
+@compiled
+def reach(low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], i: int, direction: Vector) -> float:
+    """How far box i extends in the direction: no point in it lies farther."""
+    total = 0.0
+    for axis in range(3):
+        total += max(low[axis, i] * direction[axis], high[axis, i] * direction[axis])
+    return total
 
 
 @compiled
@@ -81,12 +109,7 @@ def foot_on_face(simplex: npt.NDArray[np.float64], face: int) -> tuple[bool, Vec
         if face >> i & 1:
             corners[count] = simplex[i]
             count += 1
-    a, b, c, d = (
-        (corners[0, 0], corners[0, 1], corners[0, 2]),
-        (corners[1, 0], corners[1, 1], corners[1, 2]),
-        (corners[2, 0], corners[2, 1], corners[2, 2]),
-        (corners[3, 0], corners[3, 1], corners[3, 2]),
-    )
+    a, b, c, d = row(corners, 0), row(corners, 1), row(corners, 2), row(corners, 3)
     if count == 1:
         return True, a
     if count == 2:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.errors import ParallelToTravelError, RaysMeetBehindError, UnboundedError
 from knee_gap_uncertainty.two_views import TwoViews
-from knee_gap_uncertainty.vectors import Vector, angle, scale
+from knee_gap_uncertainty.vectors import Vector, angle, cross, dot, norm, row, scale, vector
 
 # Angles closer to 0 or pi than this cannot be told from it in double precision.
 SMALLEST_ANGLE = 1e-9
@@ -68,54 +68,62 @@ def triangulate(views: TwoViews) -> Triangulation:
 
     Raises ParallelToTravelError, RaysMeetBehindError or UnboundedError where a pair of rays gives no point.
     """
-    angles = np.empty((2, 2))
-    lengths = np.empty((2, 2))
-    for n, (own, other) in enumerate(zip(views.bearings_0, views.bearings_1, strict=True)):
-        angles[n] = triangle_angles(tuple(views.travel), tuple(own), tuple(other))
-        refuse_bad_triangle(n, views.travel, own, other, *angles[n])
-        lengths[n] = (
-            ray_length(views.baseline, angles[n, 0], angles[n, 1]),
-            ray_length(views.baseline, angles[n, 1], angles[n, 0]),
-        )
+    angles, lengths, depths, parallax = solve_triangles(views.travel, views.bearings_0, views.bearings_1)
+    for n in range(2):
+        refuse_bad_triangle(n, angles[n].tolist(), depths[n].tolist(), float(parallax[n]))
     return Triangulation(
         alpha=angles[:, 0],
         beta=angles[:, 1],
-        gamma=math.pi - angles.sum(axis=1),
+        gamma=math.pi - angles[:, 0] - angles[:, 1],
         points_first=views.lens_0 + lengths[:, :1] * views.bearings_0,
         points_second=views.lens_1 + lengths[:, 1:] * views.bearings_1,
     )
 
 
-def refuse_bad_triangle(
-    n: int,
-    travel: npt.NDArray[np.float64],
-    own: npt.NDArray[np.float64],
-    other: npt.NDArray[np.float64],
-    alpha: float,
-    beta: float,
-) -> None:
+@compiled
+def solve_triangles(
+    travel: npt.NDArray[np.float64], bearings_0: npt.NDArray[np.float64], bearings_1: npt.NDArray[np.float64]
+) -> tuple[
+    npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]
+]:
+    """Angles [rad], lengths by (2) and (1) [m], depths of closest approach [m] and parallax [rad].
+
+    The first three are (2, 2), rows points and columns lenses; the parallax (2,) is the angle between two
+    rays.
+    """
+    angles, lengths, depths, parallax = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2)), np.empty(2)
+    t = vector(travel)
+    for n in range(2):
+        own, other = row(bearings_0, n), row(bearings_1, n)
+        angles[n, 0], angles[n, 1] = triangle_angles(t, own, other)
+        lengths[n, 0] = ray_length(norm(t), angles[n, 0], angles[n, 1])
+        lengths[n, 1] = ray_length(norm(t), angles[n, 1], angles[n, 0])
+        depths[n, 0], depths[n, 1] = closest_approach(t, own, other)
+        parallax[n] = angle(own, other)
+    return angles, lengths, depths, parallax
+
+
+@compiled
+def closest_approach(travel: Vector, own: Vector, other: Vector) -> tuple[float, float]:
+    """Distances along the two rays to where they come closest [m]; negative is behind the lens."""
+    normal = cross(own, other)
+    squared = dot(normal, normal)
+    return dot(cross(travel, other), normal) / squared, dot(cross(travel, own), normal) / squared
+
+
+def refuse_bad_triangle(n: int, angles: list[float], depths: list[float], parallax: float) -> None:
     """Raise what is wrong with the rays to point n, if anything is."""
-    for name, value in (("first", alpha), ("second", beta)):
+    for name, value in zip(("first", "second"), angles, strict=True):
         if not SMALLEST_ANGLE < value < math.pi - SMALLEST_ANGLE:
             raise ParallelToTravelError(
                 f"the bearing from the {name} lens to point {n} lies along the travel "
                 f"({math.degrees(value):.3g} deg from it): it must span a triangle with it"
             )
-    gamma = math.pi - alpha - beta
-    if abs(angle(tuple(own), tuple(other))) < SMALLEST_ANGLE:
+    if parallax < SMALLEST_ANGLE:
         raise UnboundedError(f"the rays to point {n} are parallel: the point is at infinity")
-    depth_own, depth_other = closest_approach(travel, own, other)
-    if gamma <= 0 or depth_own <= 0 or depth_other <= 0:
+    gamma = math.pi - sum(angles)
+    if gamma <= 0 or min(depths) <= 0:
         raise RaysMeetBehindError(
             f"the rays to point {n} must meet in front of both lenses: parallax "
-            f"{math.degrees(gamma):.3g} deg, closest at {depth_own:.3g} m and {depth_other:.3g} m along them"
+            f"{math.degrees(gamma):.3g} deg, closest {depths[0]:.3g} m and {depths[1]:.3g} m along them"
         )
-
-
-def closest_approach(
-    travel: npt.NDArray[np.float64], own: npt.NDArray[np.float64], other: npt.NDArray[np.float64]
-) -> tuple[float, float]:
-    """Distances along the two rays to where they come closest [m]; negative is behind the lens."""
-    normal = np.cross(own, other)
-    squared = float(normal @ normal)
-    return float(np.cross(travel, other) @ normal) / squared, float(np.cross(travel, own) @ normal) / squared

@@ -3,9 +3,30 @@
 import math
 from typing import TypeAlias
 
+import numpy as np
+import numpy.typing as npt
+
 from knee_gap_uncertainty.compiled import compiled
 
 Vector: TypeAlias = tuple[float, float, float]
+
+
+@compiled
+def vector(array: npt.NDArray[np.float64]) -> Vector:
+    """Array (3,) as a vector."""
+    return array[0], array[1], array[2]
+
+
+@compiled
+def row(array: npt.NDArray[np.float64], i: int) -> Vector:
+    """Row i of an array (n, 3) as a vector."""
+    return array[i, 0], array[i, 1], array[i, 2]
+
+
+@compiled
+def column(array: npt.NDArray[np.float64], i: int) -> Vector:
+    """Column i of an array (3, n) as a vector."""
+    return array[0, i], array[1, i], array[2, i]
 
 
 @compiled
