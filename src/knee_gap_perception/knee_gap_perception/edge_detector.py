@@ -1,0 +1,317 @@
+"""From the images of a scope to the two points of the gap: find it, choose the points, follow them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_perception.camera import Camera, bearing_jacobian
+from knee_gap_perception.edge_parameters import EdgeParameters
+from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, brightness
+from knee_gap_perception.local_plane import View
+from knee_gap_perception.point_track import PointTrack, Sighting
+from knee_gap_perception.poses import LensPose
+from knee_gap_perception.section import Section, find_section
+from knee_gap_perception.segmentation.choice import segmentation_named
+from knee_gap_perception.surface_points import choose_points
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
+BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
+OVEREXPOSED_SHARE = 0.7  # of the field
+DARK_SHARE = 0.35  # of the way from gap to tissue, below which a pixel is the gap
+
+
+class _NoPoints(Exception):
+    """Why an image gives no points."""
+
+    def __init__(self, status: EdgeStatus, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Two points being followed, and when both were last seen [ns]."""
+
+    track_id: int
+    points: tuple[PointTrack, PointTrack]
+    kinds: tuple[EdgeKind, EdgeKind]
+
+
+class GapEdgeDetector:
+    """Takes the images of one scope in order and returns the edges of the gap in each.
+
+    The same images, stamps and poses give the same edges to the last bit. Nothing in the content of an image
+    raises: a status and `reason` tell what was wrong with it.
+    """
+
+    def __init__(self, parameters: EdgeParameters | None = None) -> None:
+        """Raises PerceptionError where the segmentation cannot be had (a network that cannot be read)."""
+        self.parameters = parameters or EdgeParameters()
+        self._segmentation = segmentation_named(self.parameters.segmentation, **_settings(self.parameters))
+        self._finder = FieldOfViewFinder()
+        self._track: _Track | None = None
+        self._tracks = 0
+        self._seen_ns = 0
+        self._stamp_ns: int | None = None
+        self._image: Image | None = None
+        self._thumbnail: Image | None = None
+        self._identical = 0
+        self._clicked: Array | None = None
+        self._reason = "no image was looked at yet"
+        # OpenCV's threads would fight with the other nodes for a gain of nothing at these sizes.
+        cv2.setNumThreads(1)
+
+    @property
+    def reason(self) -> str:
+        """Why the last image gave no valid points, in words; empty where it did."""
+        return self._reason
+
+    def end_track(self) -> None:
+        """Forget the points; the next image starts a new track."""
+        self._track = None
+
+    def choose_at(self, pixel: npt.ArrayLike) -> None:
+        """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
+        self._clicked = np.asarray(pixel, dtype=np.float64)
+        self.end_track()
+
+    def process(
+        self,
+        stamp_ns: int,
+        image: Image,
+        camera: Camera,
+        lens_pose: LensPose | None = None,
+        frame_id: str = "arthroscope_optical",
+    ) -> GapEdges:
+        """The edges in an image (h, w, 3), blue green red, or (h, w) grey, exposed at a stamp [ns].
+
+        `lens_pose` is the pose of the lens at that stamp where it is known. It foretells where the points are,
+        through whatever hides them; where they are seen the image decides.
+        """
+        try:
+            picture = self._checked(stamp_ns, image, camera)
+            view = View.of(lens_pose) if lens_pose is not None else None
+            edges = self._points(stamp_ns, picture, camera, view, frame_id)
+            self._reason = ""
+        except _NoPoints as refusal:
+            self._reason = str(refusal)
+            track_id = self._track.track_id if self._track is not None else 0
+            edges = GapEdges.without_points(stamp_ns, frame_id, refusal.status, track_id)
+        except PerceptionError as error:
+            self._reason = str(error)
+            edges = GapEdges.without_points(stamp_ns, frame_id, EdgeStatus.UNKNOWN)
+        return edges
+
+    def gap_mask(self) -> Image:
+        """Gap of the last image, 255 where it is (h, w); (0, 0) before the first image."""
+        if self._image is None:
+            return np.zeros((0, 0), np.uint8)
+        shape = self._image.shape[:2]
+        field = self._finder.find(self._image)
+        if field is None:
+            return np.zeros(shape, np.uint8)
+        small, scale = self._working_size(self._image)
+        dark = self._segmentation(small, field.mask(small.shape[:2], scale))
+        full = cv2.resize(dark.astype(np.uint8) * 255, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+        return np.where(full > 127, 255, 0).astype(np.uint8)
+
+    def _checked(self, stamp_ns: int, image: Image, camera: Camera) -> Image:
+        """The image as blue, green, red, if it and its stamp can be used at all."""
+        if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+            self._refuse(
+                f"an image must be (h, w, 3) or (h, w) of 8 bits, not {image.shape} of {image.dtype}"
+            )
+        if min(image.shape[:2]) < 64:
+            self._refuse(f"an image must have at least 64x64 px, not {image.shape[1]}x{image.shape[0]} px")
+        if (camera.width_px, camera.height_px) != (image.shape[1], image.shape[0]):
+            self.end_track()
+            self._refuse(
+                f"camera_info is for {camera.width_px}x{camera.height_px} px, "
+                f"the image has {image.shape[1]}x{image.shape[0]} px"
+            )
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            backwards = self._stamp_ns - stamp_ns
+            self.end_track()
+            self._stamp_ns = stamp_ns
+            if not backwards:
+                self._refuse("the image has the stamp of the one before")
+        self._stamp_ns = stamp_ns
+        picture = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        if self._image is not None and self._image.shape != picture.shape:
+            self.end_track()
+        self._image = picture
+        self._check_frozen(picture)
+        return picture
+
+    def _refuse(self, reason: str) -> None:
+        raise _NoPoints(EdgeStatus.UNKNOWN, reason)
+
+    def _check_frozen(self, picture: Image) -> None:
+        # Noise makes every image of a live camera differ, even of a scene that does not move.
+        thumbnail = picture[3::8, 3::8].copy()
+        same = self._thumbnail is not None and np.array_equal(thumbnail, self._thumbnail)
+        self._thumbnail = thumbnail
+        self._identical = self._identical + 1 if same else 0
+        if self._identical + 1 >= self.parameters.frozen_images:
+            raise _NoPoints(
+                EdgeStatus.UNKNOWN, f"the video is frozen: {self._identical + 1} identical images"
+            )
+
+    def _points(
+        self, stamp_ns: int, picture: Image, camera: Camera, view: View | None, frame_id: str
+    ) -> GapEdges:
+        field = self._finder.find(picture)
+        if field is None:
+            self.end_track()
+            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is too dark to find the field of view in")
+        grey = np.asarray(cv2.extractChannel(picture, 1), np.uint8)
+        if self._track is None:
+            sightings = self._start(stamp_ns, picture, grey, camera, view, field)
+        else:
+            sightings = self._follow(stamp_ns, grey, camera, view, field)
+        return self._edges(stamp_ns, frame_id, camera, sightings)
+
+    def _start(
+        self,
+        stamp_ns: int,
+        picture: Image,
+        grey: Image,
+        camera: Camera,
+        view: View | None,
+        field: FieldOfView,
+    ) -> list[Sighting]:
+        """Find the gap, choose the points and begin a track."""
+        section = self._section(picture, camera, field)
+        coarseness = camera.radians_per_pixel(section.centre)
+        points = choose_points(grey, section, field, self.parameters.inset / coarseness)
+        if points is None:
+            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the tissue beside the gap has no texture to follow")
+        dark_below = section.levels[0] + DARK_SHARE * (section.levels[1:] - section.levels[0])
+        tracks = tuple(
+            PointTrack(grey, point.pixel, float(dark), camera, view)
+            for point, dark in zip(points, dark_below, strict=True)
+        )
+        self._tracks += 1
+        self._clicked = None
+        self._seen_ns = stamp_ns
+        self._track = _Track(self._tracks, (tracks[0], tracks[1]), (EdgeKind.UNKNOWN, EdgeKind.UNKNOWN))
+        return [track.first for track in tracks]
+
+    def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:
+        """The section of the gap; raises _NoPoints where the picture shows none."""
+        small, scale = self._working_size(picture)
+        inside = field.mask(small.shape[:2], scale, self.parameters.field_margin * field.extent)
+        value = brightness(small)
+        self._check_light(value[inside])
+        dark = self._segmentation(small, inside)
+        section = find_section(dark, value, field, scale, self._region(field))
+        if section is None:
+            raise _NoPoints(
+                EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
+            )
+        width = float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
+        if not width >= self.parameters.minimum_width:
+            raise _NoPoints(
+                EdgeStatus.NO_GAP,
+                f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
+                f"{np.degrees(self.parameters.minimum_width):.1f} deg",
+            )
+        if section.contrast.min() < self.parameters.minimum_contrast:
+            raise _NoPoints(
+                EdgeStatus.NO_GAP,
+                f"the dark part is shaded tissue: contrast {section.contrast.min():.2f}, a gap has at least "
+                f"{self.parameters.minimum_contrast:.2f}",
+            )
+        return section
+
+    def _check_light(self, values: Image) -> None:
+        if values.size == 0 or np.percentile(values, 95) < DARK_PICTURE:
+            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
+        if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
+            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+
+    def _region(self, field: FieldOfView) -> tuple[Array, float]:
+        """Centre and radius [px] of the region of interest."""
+        radius = self.parameters.region_radius * field.extent
+        if self._clicked is not None:
+            return self._clicked, min(radius, 0.2 * field.extent)
+        centre = np.array(self.parameters.region_centre)
+        return np.where(np.isnan(centre), np.array(field.centre), centre), radius
+
+    def _working_size(self, picture: Image) -> tuple[Image, float]:
+        scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
+        size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8), scale
+
+    def _follow(
+        self, stamp_ns: int, grey: Image, camera: Camera, view: View | None, field: FieldOfView
+    ) -> list[Sighting]:
+        """Both points in the next image; ends the track, and says why, where they cannot be had."""
+        assert self._track is not None
+        sightings = [point.follow(grey, camera, view) for point in self._track.points]
+        if all(sighting.seen for sighting in sightings):
+            self._seen_ns = stamp_ns
+        margin = self.parameters.field_margin * field.extent
+        if any(field.depth_inside(sighting.position) < margin for sighting in sightings):
+            raise self._ended(EdgeStatus.OUT_OF_VIEW, "a point has left the field of view")
+        if stamp_ns - self._seen_ns > 1e9 * self.parameters.maximum_unseen:
+            raise self._ended(EdgeStatus.LOW_CONTRAST, "a point was hidden for too long")
+        return sightings
+
+    def _ended(self, status: EdgeStatus, reason: str) -> _NoPoints:
+        self.end_track()
+        return _NoPoints(status, reason)
+
+    def _edges(self, stamp_ns: int, frame_id: str, camera: Camera, sightings: list[Sighting]) -> GapEdges:
+        """The message's values; raises _NoPoints where the points are not known well enough."""
+        assert self._track is not None
+        pixels = np.stack([sighting.position for sighting in sightings])
+        bearings = camera.bearings(pixels)
+        jacobians = [bearing_jacobian(camera, pixel) for pixel in pixels]
+        covariances = np.stack(
+            [
+                jacobian @ sighting.covariance @ jacobian.T
+                for jacobian, sighting in zip(jacobians, sightings, strict=True)
+            ]
+        )
+        if not np.isfinite(bearings).all() or not np.isfinite(covariances).all():
+            raise self._ended(EdgeStatus.OUT_OF_VIEW, "a point has left what the camera model describes")
+        worst = max(float(np.linalg.eigvalsh(covariance)[-1]) for covariance in covariances)
+        angular_error = self.parameters.error_factor * float(np.sqrt(worst))
+        if angular_error > self.parameters.maximum_angular_error:
+            raise _NoPoints(
+                EdgeStatus.LOW_CONTRAST,
+                f"a point is known to {np.degrees(angular_error):.2f} deg only, needed are "
+                f"{np.degrees(self.parameters.maximum_angular_error):.2f} deg",
+            )
+        return GapEdges(
+            stamp_ns=stamp_ns,
+            frame_id=frame_id,
+            status=EdgeStatus.VALID,
+            track_id=self._track.track_id,
+            bearings=bearings,
+            pixels=pixels,
+            kinds=self._track.kinds,
+            covariances=covariances,
+            angular_error=angular_error,
+        )
+
+
+def _settings(parameters: EdgeParameters) -> dict[str, object]:
+    """Settings of the segmentation that the parameters name."""
+    if parameters.segmentation != "onnx":
+        return {}
+    return {
+        "path": parameters.network_path,
+        "input_size": parameters.network_input_size,
+        "mean": parameters.network_mean,
+        "scale": parameters.network_scale,
+    }

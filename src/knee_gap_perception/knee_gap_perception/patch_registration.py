@@ -1,0 +1,216 @@
+"""Registration of a small piece of surface from one image to another, by its texture.
+
+A patch is taken around a point of the surface, without its shading: brightness is taken against its local
+mean and contrast, so that a light that moves, its highlights and an exposure that adapts change little. Pixels that are not the surface (the gap,
+glare, the surround) have no weight. The patch is then found in another image under an affine warp
+pixel = position + shape q, q [px] counted from the point in the patch, by Gauss-Newton on the weighted squares
+(inverse compositional: Baker and Matthews 2004), held to a prediction by priors on position and shape.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
+
+LOCAL_MEAN = 17  # [px] side of the window of the local mean and contrast
+FAINT = 0.01  # [-] contrast of detail added to the local one: noise must not look like texture
+DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
+HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
+GLARE = 246  # [grey levels] above which a pixel shows the lamp
+GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
+NOISE_CORRELATION = 6.0  # factor on the variance: the residuals of neighbouring pixels are not independent
+MAXIMUM_ITERATIONS = 12
+CONVERGED = 0.01  # [px]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Texture (h, w) [-] and weight (h, w) in [0, 1] of a crop; `origin` is the pixel of its first column, row."""
+
+    texture: Float32
+    weight: Float32
+    origin: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Warp:
+    """pixel = position (2,) [px] + shape (2, 2) q."""
+
+    position: Array
+    shape: Array
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where a patch was found.
+
+    `covariance` (6, 6) is that of position x, y [px] and shape xx, xy, yx, yy, from the image's noise and the
+    prior; `correlation` [-1, 1] is that of the textures, `seen` the share [0, 1] of the patch that was the surface.
+    """
+
+    warp: Warp
+    covariance: Array
+    correlation: float
+    seen: float
+    converged: bool
+
+
+def surface_around(
+    grey: Image,
+    centre: Array,
+    half_size: int,
+    dark_below: float,
+    field_mask: npt.NDArray[np.bool_] | None = None,
+) -> Surface:
+    """Texture and weight of the square of an image (h, w) around a pixel; outside the image there is no weight."""
+    column, row = int(np.floor(centre[0])) - half_size, int(np.floor(centre[1])) - half_size
+    side = 2 * half_size + 1
+    crop = np.zeros((side, side), np.uint8)
+    valid = np.zeros((side, side), np.uint8)
+    top, left = max(0, row), max(0, column)
+    bottom, right = min(grey.shape[0], row + side), min(grey.shape[1], column + side)
+    if bottom > top and right > left:
+        inner = np.s_[top - row : bottom - row, left - column : right - column]
+        crop[inner] = grey[top:bottom, left:right]
+        valid[inner] = 1 if field_mask is None else field_mask[top:bottom, left:right]
+    smooth = cv2.GaussianBlur(crop, (3, 3), 0).astype(np.float32)
+    surface = valid * ((smooth > dark_below) & (smooth < GLARE))
+    surface = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(np.float32)
+    window = (LOCAL_MEAN, LOCAL_MEAN)
+    total = cv2.boxFilter(smooth * surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    mean = total / np.maximum(count, 1.0)
+    detail = surface * (smooth - mean) / (mean + DARK_OFFSET)
+    level = float(np.median(mean[surface > 0])) if surface.any() else 0.0
+    # A highlight is brighter than the tissue around it and moves with the lamp.
+    highlight = np.clip((mean / max(level, 1.0) - HIGHLIGHT) / 0.3, 0.0, 1.0)
+    power = cv2.boxFilter(detail * detail, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    strength = np.sqrt(np.maximum(power, 0.0) / np.maximum(count, 1.0))
+    weight = (surface * (1.0 - 0.9 * highlight)).astype(np.float32)
+    return Surface(detail / (strength + FAINT), weight, (column, row))
+
+
+class Patch:
+    """A piece of surface around a point, ready to be found in other images."""
+
+    def __init__(self, surface: Surface, position: Array, half_size: int) -> None:
+        """Take the patch of side 2 half_size + 1 around a pixel (2,)."""
+        self.half_size = half_size
+        identity = Warp(position, np.eye(2))
+        self._grid = _grid(half_size)
+        self.texture = _sample(surface.texture, surface, identity, self._grid)
+        seen = _sample(surface.weight, surface, identity, self._grid)
+        q = self._grid
+        window = np.exp(-(q**2).sum(axis=-1) / (2 * (0.55 * half_size) ** 2)).astype(np.float32)
+        self.window_sum = float(window.sum())
+        self.weight = seen * window
+        dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
+        dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
+        x, y = q[..., 0], q[..., 1]
+        # Columns: shift x, shift y, shape xx, xy, yx, yy, gain.
+        steepest = np.stack([dx, dy, dx * x, dx * y, dy * x, dy * y, self.texture], axis=-1)
+        self._steepest = steepest.reshape(-1, 7).astype(np.float32)
+
+    def information(self) -> Array:
+        """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift."""
+        gradient = self._steepest[:, :2] * np.sqrt(self.weight.reshape(-1, 1))
+        return np.asarray(gradient.T @ gradient, dtype=np.float64)
+
+    def find(self, surface: Surface, start: Warp, prior: Array) -> Registration:
+        """The patch in another image, from a predicted warp with the covariance (6, 6) of its parameters.
+
+        The parameters are position x, y [px] and shape xx, xy, yx, yy [-].
+        """
+        # A step s of the patch changes the warp's parameters by -jacobian s.
+        jacobian = np.kron(np.eye(3), np.eye(2))
+        jacobian[:2, :2] = start.shape
+        jacobian[2:, 2:] = np.kron(start.shape, np.eye(2))
+        prior_information = np.zeros((7, 7))
+        prior_information[:6, :6] = jacobian.T @ np.linalg.inv(prior) @ jacobian
+        prior_information[6, 6] = 1.0 / GAIN_PRIOR**2
+        warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
+        for _ in range(MAXIMUM_ITERATIONS):
+            residual, weight = self._residual(surface, warp, gain)
+            noise = _spread(residual, weight)
+            weighted = self._steepest * (weight * _robust(residual, noise))[:, None]
+            precision = 1.0 / (NOISE_CORRELATION * noise**2)
+            hessian = (self._steepest.T @ weighted).astype(np.float64) * precision
+            slope = (weighted.T @ residual).astype(np.float64) * precision
+            step = np.linalg.solve(hessian + prior_information, slope - prior_information @ deviation)
+            deviation += step
+            gain = float(np.clip(gain + step[6], 0.3, 3.0))
+            warp = _compose(warp, step[:6])
+            if (
+                np.linalg.norm(warp.shape @ step[:2]) < CONVERGED
+                and np.abs(step[2:6]).max() * self.half_size < 0.1
+            ):
+                converged = True
+                break
+        covariance = jacobian @ np.linalg.inv(hessian + prior_information)[:6, :6] @ jacobian.T
+        return self._judge(surface, warp, gain, noise, (covariance + covariance.T) / 2, converged)
+
+    def _residual(self, surface: Surface, warp: Warp, gain: float) -> tuple[Float32, Float32]:
+        """Difference of the warped image from the patch (n,) and its weight (n,)."""
+        seen = _sample(surface.weight, surface, warp, self._grid)
+        texture = _sample(surface.texture, surface, warp, self._grid)
+        return (texture - np.float32(gain) * self.texture).reshape(-1), (self.weight * seen).reshape(-1)
+
+    def _judge(
+        self, surface: Surface, warp: Warp, gain: float, noise: float, covariance: Array, converged: bool
+    ) -> Registration:
+        residual, weight = self._residual(surface, warp, gain)
+        share = float(weight.sum()) / max(float(self.weight.sum()), 1e-9)
+        weight = weight * _robust(residual, noise)
+        a = self.texture.reshape(-1).astype(np.float64)
+        b = residual.astype(np.float64) + gain * a
+        mass = max(float(weight.sum()), 1e-9)
+        a, b = a - (weight * a).sum() / mass, b - (weight * b).sum() / mass
+        norm = np.sqrt((weight * a * a).sum() * (weight * b * b).sum())
+        correlation = float((weight * a * b).sum() / norm) if norm > 0 else 0.0
+        return Registration(warp, covariance, correlation, share, converged)
+
+
+def _robust(residual: Float32, noise: float) -> Float32:
+    """Geman and McClure's weight of residuals: debris and highlights are no texture of the surface."""
+    return np.asarray(1.0 / (1.0 + (residual / np.float32(3.0 * noise)) ** 2) ** 2, dtype=np.float32)
+
+
+def _grid(half_size: int) -> Float32:
+    """Offsets (n, n, 2) of the pixels of a patch from its centre."""
+    line = np.arange(-half_size, half_size + 1, dtype=np.float32)
+    x, y = np.meshgrid(line, line)
+    return np.stack([x, y], axis=-1)
+
+
+def _sample(values: Float32, surface: Surface, warp: Warp, grid: Float32) -> Float32:
+    """Values of a crop at the pixels that a warp sends the grid (n, n, 2) to; 0 outside the crop."""
+    shape = warp.shape.astype(np.float64)
+    offset = warp.position - np.array(surface.origin, dtype=np.float64)
+    # warpAffine takes (column, row) of the patch, counted from its corner, to those of the crop.
+    corner = offset + shape @ grid[0, 0].astype(np.float64)
+    matrix = np.concatenate([shape, corner[:, None]], axis=1)
+    side = grid.shape[0]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(values, matrix, (side, side), flags=flags, borderValue=0), dtype=np.float32
+    )
+
+
+def _compose(warp: Warp, step: Array) -> Warp:
+    """warp o step^-1, the inverse compositional update; a shape never changes by more than a third at once."""
+    change = np.eye(2) + np.clip(step[2:].reshape(2, 2), -0.3, 0.3)
+    inverse = np.linalg.inv(change)
+    return Warp(warp.position - warp.shape @ inverse @ step[:2], warp.shape @ inverse)
+
+
+def _spread(residual: Float32, weight: Float32) -> float:
+    """Robust standard deviation of the residuals that have weight."""
+    used = np.abs(residual[weight > 0.05])
+    if used.size < 16:
+        return 1.0
+    return max(1.4826 * float(np.median(used)), 0.05)

@@ -1,0 +1,219 @@
+"""One surface point, followed from image to image by the texture around it.
+
+The point is defined by the first image. Every later image is registered against a patch of an earlier one: the
+first image's as long as the surface looks alike, then a patch taken at a later image, whose own error it inherits.
+So the error grows with the number of patches handed on (a few over a travel), not with the number of images.
+
+Where the pose of the lens is known it foretells, with the surface's tangent plane, where the patch will be and
+what shape it will have; otherwise the last image and even motion do.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_perception.camera import Camera
+from knee_gap_perception.local_plane import LocalPlane, Prediction, View
+from knee_gap_perception.patch_registration import Patch, Registration, Surface, Warp, surface_around
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+PATCH_HALF = 32  # [px] half side of a patch
+SEARCH = 16  # [px] how far the point may be from its prediction
+CROP_HALF = int(1.5 * PATCH_HALF) + SEARCH
+MILD = (
+    0.35  # change of shape, as logarithm of stretch or turn [rad], up to which an earlier patch still serves
+)
+FRESH = 0.80  # correlation above which a patch needs no successor
+GOOD = 0.70  # correlation from which a new patch may be taken
+CLEAR = 0.85  # share of the patch that must be seen, free of highlights, to take a new one
+FAIR = 0.60  # correlation below which the point is not seen
+REST = 8  # images for which a patch that was not found is not tried
+MINIMUM_SEEN = 0.35  # share of the patch
+HANDOVER_ERROR = 0.50  # [px] error that a patch adds when it is taken from a later image
+REGISTRATION_FLOOR = 0.40  # [px] below which no registration is believed
+MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
+SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
+MAXIMUM_PATCHES = 24
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The point in one image: position (2,) [px], its covariance (2, 2) [px^2], and whether it was seen."""
+
+    position: Array
+    covariance: Array
+    seen: bool
+    correlation: float
+
+
+@dataclass
+class _Anchor:
+    """A patch and the image it came from: pixel (2,), view, shape (2, 2) against the first patch.
+
+    `covariance` (2, 2) [px^2] is that of the point in that image; `rest` counts images until it is tried again.
+    """
+
+    patch: Patch
+    pixel: Array
+    view: View | None
+    shape: Array
+    covariance: Array
+    rest: int = 0
+
+
+class PointTrack:
+    """Follows one surface point through a stream of grey images."""
+
+    def __init__(
+        self, grey: Image, pixel: Array, dark_below: float, camera: Camera, view: View | None
+    ) -> None:
+        """Start at a pixel (2,) of an image (h, w); grey levels below `dark_below` are the gap."""
+        surface = surface_around(grey, pixel, CROP_HALF, dark_below)
+        patch = Patch(surface, pixel, PATCH_HALF)
+        self._anchors = [_Anchor(patch, pixel, view, np.eye(2), np.zeros((2, 2)))]
+        self._plane = LocalPlane(camera.bearings(pixel), view) if view is not None else None
+        self._warp = Warp(pixel, np.eye(2))
+        self._velocity = np.zeros(2)
+        self._darkness = dark_below / max(_level(grey, pixel), 1.0)
+        self._covariance = np.zeros((2, 2))
+        self._unseen = 0
+
+    @property
+    def first(self) -> Sighting:
+        """The point in the image that defines it."""
+        return Sighting(self._anchors[0].pixel, REGISTRATION_FLOOR**2 * np.eye(2), True, 1.0)
+
+    @property
+    def unseen(self) -> int:
+        """Images since the point was last seen."""
+        return self._unseen
+
+    @property
+    def patches(self) -> int:
+        """Patches taken so far."""
+        return len(self._anchors)
+
+    def follow(self, grey: Image, camera: Camera, view: View | None) -> Sighting:
+        """The point in the next image (h, w), and the view it was taken from where that is known."""
+        predictions = {index: self._predict(index, camera, view) for index in self._candidates()}
+        centre = next(iter(predictions.values())).warp.position
+        surface = surface_around(grey, centre, CROP_HALF, self._darkness * _level(grey, centre))
+        best: tuple[int, Registration] | None = None
+        for index, prediction in predictions.items():
+            anchor = self._anchors[index]
+            start = self._coarse(anchor.patch, surface, prediction)
+            found = anchor.patch.find(surface, start, prediction.covariance)
+            anchor.rest = 0 if _believable(found, prediction) else REST
+            if _believable(found, prediction):
+                best = (index, found)
+                break
+        if best is None:
+            return self._coast(predictions[len(self._anchors) - 1], view)
+        return self._accept(best[0], best[1], predictions[best[0]], surface, view)
+
+    def _candidates(self) -> list[int]:
+        """Patches to try: the earliest that should look alike, then the newest."""
+        mild = []
+        for index, anchor in enumerate(self._anchors):
+            anchor.rest = max(0, anchor.rest - 1)
+            if not anchor.rest and _strain(self._warp.shape @ np.linalg.inv(anchor.shape)) < MILD:
+                mild.append(index)
+        newest = len(self._anchors) - 1
+        return list(dict.fromkeys([*mild[:1], newest]))
+
+    def _predict(self, index: int, camera: Camera, view: View | None) -> Prediction:
+        anchor = self._anchors[index]
+        if self._plane is not None and view is not None and anchor.view is not None:
+            prediction = self._plane.predict(camera, anchor.view, anchor.pixel, view)
+            if prediction is not None:
+                return prediction
+        growth = 1.0 + self._unseen
+        warp = Warp(self._warp.position + self._velocity, self._warp.shape @ np.linalg.inv(anchor.shape))
+        variances = [(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4
+        return Prediction(warp, np.diag(variances), np.zeros((6, 3)))
+
+    def _coarse(self, patch: Patch, surface: Surface, prediction: Prediction) -> Warp:
+        """Best whole-pixel position around the prediction, the patch drawn as it should look there."""
+        side = 2 * PATCH_HALF + 1
+        warp = prediction.warp
+        inverse = np.linalg.inv(warp.shape)
+        centre = np.array([PATCH_HALF, PATCH_HALF], float)
+        matrix = np.concatenate([inverse, (centre - inverse @ centre)[:, None]], axis=1)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        drawn = cv2.warpAffine(patch.texture * patch.weight, matrix, (side, side), flags=flags)
+        spread = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
+        reach = int(np.clip(np.ceil(3.0 * spread), 3, SEARCH))
+        first = np.rint(warp.position - np.array(surface.origin)).astype(int) - PATCH_HALF - reach
+        window = np.s_[first[1] : first[1] + side + 2 * reach, first[0] : first[0] + side + 2 * reach]
+        score = cv2.matchTemplate(
+            surface.texture[window] * surface.weight[window], drawn, cv2.TM_CCORR_NORMED
+        )
+        rows, columns = np.mgrid[0 : score.shape[0], 0 : score.shape[1]]
+        away = np.hypot(rows - reach, columns - reach) / reach
+        row, column = np.unravel_index(int((score - 0.15 * away**2).argmax()), score.shape)
+        return Warp(warp.position + np.array([column - reach, row - reach], float), warp.shape)
+
+    def _coast(self, prediction: Prediction, view: View | None) -> Sighting:
+        """The prediction alone, while the point is not seen."""
+        self._unseen += 1
+        self._velocity = 0.8 * self._velocity
+        newest = self._anchors[-1]
+        self._warp = Warp(prediction.warp.position, prediction.warp.shape @ newest.shape)
+        known = self._plane is not None and view is not None
+        error = newest.covariance if known else self._covariance
+        self._covariance = error + prediction.covariance[:2, :2]
+        return Sighting(prediction.warp.position, self._covariance, False, 0.0)
+
+    def _accept(
+        self, index: int, found: Registration, prediction: Prediction, surface: Surface, view: View | None
+    ) -> Sighting:
+        anchor = self._anchors[index]
+        covariance = anchor.covariance + found.covariance[:2, :2] + REGISTRATION_FLOOR**2 * np.eye(2)
+        moved = found.warp.position - self._warp.position
+        self._velocity = np.zeros(2) if self._unseen else 0.5 * self._velocity + 0.5 * moved
+        self._unseen = 0
+        self._warp = Warp(found.warp.position, found.warp.shape @ anchor.shape)
+        self._covariance = covariance
+        if self._plane is not None and view is not None:
+            parameters = np.concatenate([found.warp.position, found.warp.shape.reshape(-1)])
+            self._plane.learn(prediction, parameters, found.covariance)
+        newest = index == len(self._anchors) - 1
+        strained = _strain(found.warp.shape) > MILD or found.correlation < FRESH
+        clear = found.correlation > GOOD and found.seen > CLEAR
+        if newest and strained and clear and index < MAXIMUM_PATCHES:
+            grown = covariance + HANDOVER_ERROR**2 * np.eye(2)
+            patch = Patch(surface, found.warp.position, PATCH_HALF)
+            self._anchors.append(_Anchor(patch, found.warp.position, view, self._warp.shape, grown))
+        return Sighting(found.warp.position, covariance, True, found.correlation)
+
+
+def _level(grey: Image, position: Array) -> float:
+    """Brightness of the tissue around a pixel: the upper quartile of a sparse neighbourhood."""
+    row, column = round(float(position[1])), round(float(position[0]))
+    patch = grey[max(0, row - 24) : row + 25 : 4, max(0, column - 24) : column + 25 : 4]
+    return float(np.percentile(patch, 75)) if patch.size else 0.0
+
+
+def _strain(shape: Array) -> float:
+    """How far a shape (2, 2) is from none: the largest logarithm of stretch, or the turn [rad]."""
+    stretches = np.linalg.svd(shape, compute_uv=False)
+    if stretches.min() <= 1e-6:
+        return float("inf")
+    turn = abs(np.arctan2(shape[1, 0] - shape[0, 1], shape[0, 0] + shape[1, 1]))
+    return float(max(np.abs(np.log(stretches)).max(), turn))
+
+
+def _believable(found: Registration, prediction: Prediction) -> bool:
+    away = found.warp.position - prediction.warp.position
+    distance = float(away @ np.linalg.solve(prediction.covariance[:2, :2], away))
+    return (
+        found.correlation > FAIR
+        and found.seen > MINIMUM_SEEN
+        and distance < 25.0
+        and _strain(found.warp.shape) < 1.2
+        and bool(np.isfinite(found.covariance).all())
+    )

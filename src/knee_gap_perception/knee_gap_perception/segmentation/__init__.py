@@ -1,0 +1,1 @@
+"""Which pixels are the dark gap: strategies behind one Protocol, chosen by name."""
