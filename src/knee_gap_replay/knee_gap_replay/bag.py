@@ -4,13 +4,14 @@ A bag is a folder with `metadata.yaml` and MCAP files, as `ros2 bag` and Foxglov
 read too. Times are integer nanoseconds.
 """
 
+import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from rosbags.interfaces import Connection, Qos
+from rosbags.interfaces import Connection, Nodetype, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -26,6 +27,8 @@ from knee_gap_replay.types import full_name, known_type, typestore
 
 # DDS pads what it sends; a bag written here and played and recorded again then has the same bytes.
 _DDS_ALIGNMENT = 4
+_STAMP_END = 12
+_HEADER_FIELD = ("header", (Nodetype.NAME, "std_msgs/msg/Header"))
 
 
 class BagMessage(NamedTuple):
@@ -150,6 +153,7 @@ class BagReader:
         self.path = Path(path)
         self.metadata: dict[str, str] = {}
         self._stores: dict[str, Typestore] = {}
+        self._has_header: dict[str, bool] = {}
         self._files: list[McapFile] = []
         self._missing: list[str] = []
         try:
@@ -172,6 +176,11 @@ class BagReader:
         """Close the files of the bag."""
         for file in self._files:
             file.close()
+
+    @property
+    def message_count(self) -> int:
+        """Messages in the bag, as its index tells it; 0 where it has none."""
+        return sum(block.message_count for file in self._files for block in file.blocks)
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -202,6 +211,20 @@ class BagReader:
         except Exception as error:  # rosbags' generated code fails in many ways on bytes that do not fit
             reason = str(error) or type(error).__name__
             raise BagError(f"a {message.msgtype} on {message.topic} cannot be read: {reason}") from None
+
+    def stamp_ns(self, message: BagMessage) -> int | None:
+        """Return the stamp [ns] of the message's header, without reading the rest; None where it has none."""
+        topic = self.details[message.topic]
+        if topic.encoding != "cdr" or len(message.data) < _STAMP_END:
+            return None
+        if message.msgtype not in self._has_header:
+            fields = self._store(message.msgtype, topic.definition).fielddefs[message.msgtype][1]
+            self._has_header[message.msgtype] = fields[0] == _HEADER_FIELD
+        if not self._has_header[message.msgtype]:
+            return None
+        # CDR: one byte, then the order of bytes (odd: little endian), options, and the message itself.
+        seconds, nanoseconds = struct.unpack_from("<iI" if message.data[1] & 1 else ">iI", message.data, 4)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def _messages(self, topics: frozenset[str] | None) -> Iterator[BagMessage]:
         for entry in in_time_order(self._files, topics):

@@ -1,13 +1,14 @@
 """One MCAP file, whole, cut or damaged: its blocks of messages, in order of time.
 
-The file is walked record by record, headers only, and its index is used to find the way again where the walk
-breaks off. What cannot be read is named once, in one line, and everything else is given.
+Blocks are found by the index at the end, or, where it is missing or damaged, by a walk over the heads of the
+records. What cannot be read is named once, in one line, and everything else is given.
 """
 
 import heapq
 import logging
 import os
 import struct
+import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -26,6 +27,9 @@ _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")
 _TIMES = struct.Struct("<QQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
+_FOOTER = struct.Struct("<BQQQI")
+_CHECKSUM_SIZE = 4
+_OPCODES = frozenset(int(opcode) for opcode in Opcode)
 _INDEX_ENTRY_SIZE = 16
 _INDEX_HEAD_SIZE = 6
 
@@ -103,11 +107,10 @@ class McapFile:
                 raise BagError(f"{self.path} is not an MCAP file")
             self._lose("the first bytes of the file are damaged")
         summary = self._summary()
-        indexed = {index.chunk_start_offset: index for index in summary.chunk_indexes} if summary else {}
-        self._walk(sorted(indexed), summary is not None)
-        known = {block.offset for block in self.blocks}
-        for offset in sorted(set(indexed) - known):
-            self._lose(f"the messages at byte {offset} lost: no chunk where the index says one is")
+        if summary is not None and summary.chunk_indexes:
+            self._use_index(summary)
+        else:
+            self._walk()
         if summary is not None:
             self.schemas.update(summary.schemas)
             self.channels.update(summary.channels)
@@ -122,36 +125,48 @@ class McapFile:
         try:
             self._file.seek(0)
             summary = make_reader(self._file).get_summary()
+            self._file.seek(-(_FOOTER.size + MAGIC_SIZE), os.SEEK_END)
+            _, _, start, _, told = _FOOTER.unpack(self._file.read(_FOOTER.size))
+            self._file.seek(start)
+            checked = self._file.read(self._size - start - MAGIC_SIZE - _CHECKSUM_SIZE)
         except Exception:  # a cut or damaged end fails in many ways; the walk tells what is lost
             return None
-        return summary if summary is not None and summary.channels else None
+        is_sound = told in (0, zlib.crc32(checked))
+        return summary if is_sound and summary is not None and summary.channels else None
 
-    def _walk(self, indexed: list[int], has_index: bool) -> None:
-        """Collect the blocks from the heads of the records, resuming at the next indexed chunk if need be."""
+    def _use_index(self, summary: Summary) -> None:
+        """Take the blocks from the index, and metadata from where it says."""
+        for chunk in summary.chunk_indexes:
+            # Each channel has one record: its head, its own, and an entry for each message.
+            heads = len(chunk.message_index_offsets) * (_RECORD_HEAD.size + _INDEX_HEAD_SIZE)
+            count = max(0, chunk.message_index_length - heads) // _INDEX_ENTRY_SIZE
+            length = chunk.chunk_length - _RECORD_HEAD.size
+            self.blocks.append(Block(chunk.message_start_time, chunk.chunk_start_offset, length, True, count))
+        for index in summary.metadata_indexes:
+            self._file.seek(index.offset + _RECORD_HEAD.size)
+            self._note(Opcode.METADATA, index.offset, index.length)
+
+    def _walk(self) -> None:
+        """Collect the blocks from the heads of the records, up to where they end or are damaged."""
         offset = MAGIC_SIZE
         while offset < self._size:
             self._file.seek(offset)
             head = self._file.read(_RECORD_HEAD.size)
             if len(head) < _RECORD_HEAD.size:
-                self._lose(f"cut at byte {offset}: the last {self._size - offset} bytes lost")
-                return
+                break
             opcode, length = _RECORD_HEAD.unpack(head)
             end = offset + _RECORD_HEAD.size + length
+            is_misplaced = opcode == Opcode.MESSAGE and any(block.is_chunk for block in self.blocks[:1])
+            if end > self._size or opcode not in _OPCODES or is_misplaced:
+                break
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                if not has_index and self.blocks:
+                if opcode == Opcode.DATA_END and self.blocks and self.blocks[0].is_chunk:
                     self._lose("the index at the end is damaged; read without it")
                 return
-            if end > self._size or opcode == 0:
-                resumed = next((start for start in indexed if start > offset), None)
-                until = self._size if resumed is None else resumed
-                self._lose(f"cut or damaged at byte {offset}: {until - offset} bytes lost")
-                if resumed is None:
-                    return
-                offset = resumed
-                continue
             self._note(opcode, offset, length)
             offset = end
-        self._lose("no end mark: the recording was cut short")
+        rest = self._size - offset
+        self._lose(f"cut or damaged at byte {offset}: {rest} bytes lost" if rest else "ends without an index")
 
     def _note(self, opcode: int, offset: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
@@ -175,7 +190,10 @@ class McapFile:
                 self._lose(f"the {Opcode(opcode).name.lower()} at byte {offset} is damaged")
 
     def _records(self, block: Block) -> list[McapRecord]:
-        self._file.seek(block.offset + _RECORD_HEAD.size)
+        self._file.seek(block.offset)
+        opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
+        if length != block.length or opcode != (Opcode.CHUNK if block.is_chunk else Opcode.MESSAGE):
+            raise BagError("its head is damaged")
         stream = ReadDataStream(self._file)
         if not block.is_chunk:
             return [Message.read(stream, block.length)]

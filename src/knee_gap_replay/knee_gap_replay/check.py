@@ -1,0 +1,45 @@
+"""Tells what a bag holds, what is damaged, and whether knee_gap can use it."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from knee_gap_replay.bag import BagReader
+from knee_gap_replay.bag_check import TopicCheck, check_topics, reasons_against
+from knee_gap_replay.command_line import Parser, run
+from knee_gap_replay.topics import add_topic_arguments, topics_from
+
+
+def _line(check: TopicCheck, width: int) -> str:
+    rate = f"{check.rate:7.1f} Hz" if check.rate == check.rate else " " * 10
+    words = "; ".join(check.remarks())
+    return f"{check.name:{width}}  {len(check.record_ns):7d}  {rate}  {check.msgtype}  {words}".rstrip()
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    with BagReader(arguments.bag) as reader:
+        checks = check_topics(reader)
+        width = max((len(name) for name in checks), default=0)
+        for check in checks.values():
+            print(_line(check, width))
+        reasons = reasons_against(checks, topics_from(arguments, reader.topics))
+        losses = len(reader.losses)
+    print(f"{losses} damaged or missing parts" if losses else "complete and undamaged")
+    print("not usable: " + "; ".join(reasons) if reasons else "usable")
+    return 1 if reasons else 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="check", description=__doc__)
+    parser.add_argument("bag", metavar="BAG", help="bag folder or .mcap file")
+    add_topic_arguments(parser)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check a bag; 0 if it can be used."""
+    return run(_parser(), _run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

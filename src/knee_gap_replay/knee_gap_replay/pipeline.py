@@ -1,0 +1,126 @@
+"""The cores of the three live nodes in one pipeline: images, camera and tracked body in, the gap out.
+
+What passes from core to core passes as messages, as it does between the nodes.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Self
+
+from knee_gap_perception.edge_parameters import EdgeParameters
+from knee_gap_perception.edge_stream import EdgeStream
+from knee_gap_perception.messages import fill_gap_edges
+from knee_gap_perception.messages_tracking import body_pose_from_message, fill_lens_pose
+from knee_gap_perception.pose_validity import ValidityParameters
+from knee_gap_perception.poses import LensPose
+from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_replay.processing import Output
+from knee_gap_replay.qos import QosName
+from knee_gap_replay.topics import InputTopics
+from knee_gap_replay.types import blank
+from knee_gap_uncertainty import messages
+from knee_gap_uncertainty.estimator import NANOSECONDS, GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
+
+_NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
+
+
+# The parameters of each node's core.
+PARAMETERS: dict[str, tuple[type, ...]] = {
+    "segmentation_node": (EdgeParameters,),
+    "tracking_node": (TrackingParameters, ValidityParameters),
+    "uncertainty_node": (EstimatorParameters,),
+}
+
+
+class GapPipeline:
+    """Feeds the cores in the order of stamps; `space` is the namespace of what it publishes."""
+
+    @classmethod
+    def from_parameters(cls, file: ParametersFile, topics: InputTopics, space: str) -> Self:
+        """Return a pipeline of cores with the parameters of the nodes in `file`.
+
+        Raises BagError for parameters that no core has or that one refuses.
+        """
+        file.refuse_unknown(PARAMETERS)
+        built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
+        return cls(
+            EdgeStream(*built["segmentation_node"]),
+            ScopeTracker(*built["tracking_node"]),
+            GapEstimator(*built["uncertainty_node"]),
+            topics,
+            space,
+        )
+
+    def __init__(
+        self,
+        detector: EdgeStream,
+        tracker: ScopeTracker,
+        estimator: GapEstimator,
+        topics: InputTopics,
+        space: str,
+    ) -> None:
+        self._detector = detector
+        self._tracker = tracker
+        self._estimator = estimator
+        self._topics = topics
+        self._space = space
+        self._newest_stamp_ns: int | None = None
+        # The estimator's clock: it follows the stamps, and stands still where they run backwards.
+        self._now_ns = 0
+        # Before an image comes the camera's model, and the pose of the same instant.
+        self.inputs: Sequence[str] = (topics.camera_info, topics.body_pose, topics.image)
+        self.outputs: Mapping[str, tuple[str, QosName]] = {
+            self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
+            self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
+            self._topic("gap"): ("knee_gap_msgs/msg/GapEstimate", "reliable"),
+            **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
+        }
+
+    def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
+        """Take an image, a camera model or a pose of the tracked body; return what is published then."""
+        if self._newest_stamp_ns is not None:
+            self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
+        self._newest_stamp_ns = stamp_ns
+        yield from self._published(self._estimator.advance(self._now_ns))
+        if topic == self._topics.camera_info:
+            self._detector.on_camera_info(message)
+        elif topic == self._topics.body_pose:
+            yield from self._on_body_pose(message)
+        else:
+            yield from self._on_image(message)
+
+    def finish(self) -> Iterable[Output]:
+        """Return the estimates of images whose lens pose will not come any more."""
+        wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
+        yield from self._published(self._estimator.advance(self._now_ns + wait_ns + 1))
+
+    def _on_body_pose(self, message: Any) -> Iterator[Output]:
+        lens = self._tracker.update(body_pose_from_message(message))
+        if not isinstance(lens, LensPose):
+            return
+        pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
+        yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
+        estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
+        yield from self._published(estimates)
+
+    def _on_image(self, message: Any) -> Iterator[Output]:
+        edges = self._detector.on_image(message)
+        edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+        yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
+        observation = messages.edges_from_message(edges_message)
+        yield from self._published(self._estimator.add_edges(observation, self._now_ns))
+
+    def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
+        for estimate in estimates:
+            gap = messages.fill_gap_estimate(blank("knee_gap_msgs/msg/GapEstimate"), estimate)
+            yield Output(self._topic("gap"), gap, estimate.stamp_ns)
+            if estimate.status is GapStatus.VALID:
+                for name, attribute in _NUMBERS.items():
+                    number = blank("std_msgs/msg/Float64")
+                    number.data = float(getattr(estimate, attribute))
+                    yield Output(self._topic(name), number, estimate.stamp_ns)
+
+    def _topic(self, name: str) -> str:
+        return f"{self._space}/{name}"

@@ -1,0 +1,62 @@
+"""Processes a bag into a bag of results: the cores of the live nodes, without ROS.
+
+Images, camera model and poses are taken by their stamps, none is dropped, and the same bag gives the same
+bytes.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_replay.command_line import Parser, run
+from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_replay.pipeline import GapPipeline
+from knee_gap_replay.processing import process
+from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
+
+# What a bag may have beside it: the parameters that fit its scope.
+_BESIDE = "scope.yaml"
+
+
+def _parameters_path(arguments: argparse.Namespace) -> Path | None:
+    if arguments.params_file is not None:
+        return Path(arguments.params_file)
+    beside = Path(arguments.bag) / _BESIDE
+    return beside if beside.is_file() else None
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    with BagReader(arguments.bag) as reader:
+        parameters = ParametersFile(_parameters_path(arguments))
+        topics = topics_from(arguments, reader.topics)
+        pipeline = GapPipeline.from_parameters(parameters, topics, namespace_from(arguments))
+        reader.messages(pipeline.inputs)  # refuses a bag without them before anything is written
+        with BagWriter(arguments.out, metadata=reader.metadata) as writer:
+            counts = process(reader, writer, pipeline)
+    told = ", ".join(f"{count} {topic}" for topic, count in counts.items())
+    print(f"process: {told} in {arguments.out}")
+    return 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="process", description=__doc__)
+    parser.add_argument("bag", metavar="IN", help="bag folder or .mcap file")
+    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument(
+        "--params-file",
+        metavar="YAML",
+        help=f"ROS parameters of the nodes; default {_BESIDE} in the bag",
+    )
+    add_topic_arguments(parser)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Process a bag."""
+    return run(_parser(), _run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
