@@ -60,6 +60,10 @@ class Processes:
         """Where a process's output goes."""
         return self._log_folder / f"{name}.log"
 
+    def pid(self, name: str) -> int:
+        """Process id."""
+        return self._running[name].pid
+
     def wait_ready(self, names: Sequence[str], timeout: float) -> None:
         """Return once each process has said that it is ready. Raises StartError."""
         deadline = time.monotonic() + timeout

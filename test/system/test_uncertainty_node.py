@@ -1,0 +1,182 @@
+"""uncertainty_node as a process: what a controller sees when all is well, and when something is lost."""
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from live import Client
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64
+
+from knee_gap_bringup.processes import Processes, executable
+from knee_gap_msgs.msg import GapEdges, GapEstimate
+
+DOMAIN = 51
+POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
+TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
+FRAME = 1 / 60
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+
+def edges_message(stamp_ns: int, x: float, status: int = GapEdges.STATUS_VALID) -> GapEdges:
+    towards = POINTS - [x, 0.0, 0.0]
+    bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    message = GapEdges(status=status, track_id=1, angular_error=math.radians(0.3))
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    for vector, bearing in zip((message.bearing_0, message.bearing_1), bearings, strict=True):
+        vector.x, vector.y, vector.z = (float(value) for value in bearing)
+    variance = math.radians(0.1) ** 2
+    message.covariance_0 = (variance * (np.eye(3) - np.outer(bearings[0], bearings[0]))).ravel()
+    message.covariance_1 = (variance * (np.eye(3) - np.outer(bearings[1], bearings[1]))).ravel()
+    return message
+
+
+def pose_message(stamp_ns: int, x: float) -> PoseWithCovarianceStamped:
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = "world"
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    message.pose.pose.position.x = x
+    message.pose.pose.orientation.w = 1.0
+    message.pose.covariance = np.diag([1e-12] * 6).ravel()
+    return message
+
+
+class Track:
+    """Feeds a scope that travels 6 mm in a second, and then stands still."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self.frame = 0
+        self.begin_ns = 10**9 * 1_700_000_000
+
+    def run(self, frames: int, *, poses: bool = True, edges: bool = True) -> None:
+        for _ in range(frames):
+            started = time.monotonic()
+            x = min(self.frame * 1e-4, 0.006)
+            stamp = self.begin_ns + round(self.frame * FRAME * 1e9)
+            if poses:
+                self.client.publish("scope_pose", pose_message(stamp - 1_000_000, x))
+                self.client.publish("scope_pose", pose_message(stamp + 1_000_000, x))
+            if edges:
+                self.client.publish("gap_edges", edges_message(stamp, x))
+            self.frame += 1
+            self.client.spin(max(0.0, FRAME - (time.monotonic() - started)))
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    environment = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with Processes(tmp_path, environment) as started:
+        command = [executable("knee_gap_uncertainty", "uncertainty_node")]
+        started.start("uncertainty_node", [*command, "--ros-args", "-r", "__ns:=/knee_gap"])
+        started.wait_ready(["uncertainty_node"], 120.0)
+        yield started
+
+
+@pytest.fixture
+def client(processes: Processes) -> Iterator[Client]:
+    with Client(DOMAIN) as connected:
+        connected.offer(GapEdges, "gap_edges")
+        connected.offer(PoseWithCovarianceStamped, "scope_pose")
+        connected.listen(GapEstimate, "gap")
+        for name in ("gap/min", "gap/max", "gap/snr"):
+            connected.listen(Float64, name)
+        connected.wait_matched()
+        yield connected
+
+
+def test_measures_and_tells_every_loss(client: Client) -> None:
+    gap = client.received["gap"]
+    track = Track(client)
+    track.run(70)
+    client.spin_until(lambda: len(gap) >= 70)
+    good = [e for e in gap if e.status == GapEstimate.STATUS_VALID]
+    assert len(good) > 40
+    last = good[-1]
+    assert last.gap == pytest.approx(TRUE_GAP, abs=1e-6)
+    assert last.gap_min < TRUE_GAP < last.gap_max
+    assert [last.point_0.x, last.point_0.y, last.point_0.z] == pytest.approx(POINTS[0], abs=1e-6)
+    assert len(client.received["gap/min"]) == len(good)
+
+    # The tracker goes: the first image without a pose already says so, and carries no number.
+    before, numbers = len(gap), len(client.received["gap/min"])
+    track.run(6, edges=True, poses=False)
+    client.spin_until(lambda: len(gap) >= before + 6)
+    lost = gap[before : before + 6]
+    assert {e.status for e in lost} == {GapEstimate.STATUS_TRACKING_LOST}
+    assert all(math.isnan(value) for e in lost for value in (e.gap, e.gap_min, e.gap_max, e.snr))
+    assert len(client.received["gap/min"]) == numbers
+
+    # It comes back: so do the numbers.
+    before = len(gap)
+    track.run(10)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
+
+    # The images go: said within the deadline, again and again, without a number.
+    before = len(gap)
+    client.spin(0.5)
+    silence = gap[before + 1 :]
+    assert len(silence) >= 4
+    assert {e.status for e in silence} == {GapEstimate.STATUS_NO_EDGES}
+    assert all(math.isnan(e.gap) for e in silence)
+
+
+def test_rubbish_is_survived(client: Client, processes: Processes) -> None:
+    track = Track(client)
+    track.run(30)
+    gap = client.received["gap"]
+    stamp = track.begin_ns + round(track.frame * FRAME * 1e9)
+    broken = edges_message(stamp, 0.003)
+    broken.bearing_0.x = math.nan
+    client.publish("gap_edges", broken)
+    far = pose_message(stamp, math.inf)
+    client.publish("scope_pose", far)
+    turned = pose_message(stamp + 1_000_000, 0.003)
+    turned.pose.pose.orientation.w = 2.0
+    client.publish("scope_pose", turned)
+    client.publish("gap_edges", edges_message(0, 0.0))
+    client.spin(0.3)
+    processes.check("uncertainty_node")
+    assert all(e.status != GapEstimate.STATUS_VALID for e in gap[-3:])
+    # Time that ran backwards begins a new track, which measures as the first did.
+    again = Track(client)
+    before = len(gap)
+    again.run(70)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
+
+
+def test_dead_node_is_seen_by_its_deadline(client: Client, processes: Processes) -> None:
+    missed: list[object] = []
+    client.node.create_subscription(
+        GapEstimate,
+        "gap",
+        lambda _message: None,
+        QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.RELIABLE, deadline=Duration(nanoseconds=200_000_000)
+        ),
+        event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),
+    )
+    client.spin(0.5)
+    Track(client).run(20)
+    missed.clear()
+    os.kill(processes.pid("uncertainty_node"), signal.SIGKILL)
+    client.spin_until(lambda: bool(missed), timeout=5.0)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly_when_told(processes: Processes, stop: signal.Signals) -> None:
+    os.kill(processes.pid("uncertainty_node"), stop)
+    assert processes.wait("uncertainty_node") == 0
+    assert "Traceback" not in processes.log("uncertainty_node").read_text()
