@@ -1,0 +1,220 @@
+"""NatNet over UDP: the sockets and clocks around a session."""
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.optitrack.body_source import BodyFrame, SourceStatus
+from knee_gap_perception.optitrack.natnet_session import NatNetSession
+from knee_gap_perception.optitrack.up_axis import UP_AXES
+from knee_gap_perception.parameters import check_parameters
+
+MAX_PACKET_BYTES = 65_536
+# Packets read in one call, so that a flood cannot keep the caller.
+MAX_PACKETS = 512
+RECEIVE_BUFFER_BYTES = 1 << 20
+# Between two looks at what is due to be sent [s].
+STEP = 0.01
+
+
+@dataclass(frozen=True)
+class NatNetParameters:
+    """Where Motive is and how it sends. Raises PerceptionError for values outside their range."""
+
+    server_address: str = field(
+        default="127.0.0.1", metadata={"description": "Address of the machine that runs Motive"}
+    )
+    local_address: str = field(
+        default="",
+        metadata={"description": "Address of this machine's interface to Motive; empty finds it"},
+    )
+    command_port: int = field(
+        default=1510, metadata={"description": "UDP port of Motive for commands", "range": (1, 65535)}
+    )
+    transmission: str = field(
+        default="auto",
+        metadata={
+            "description": "How Motive sends; auto asks the server (NatNet 3.0 and later)",
+            "choices": ("auto", "unicast", "multicast"),
+        },
+    )
+    multicast_address: str = field(
+        default="239.255.42.99",
+        metadata={"description": "Multicast group of the data, where the server does not tell it"},
+    )
+    data_port: int = field(
+        default=1511,
+        metadata={
+            "description": "UDP port of multicast data, where the server does not tell it",
+            "range": (1, 65535),
+        },
+    )
+    max_clock_error: float = field(
+        default=0.001,
+        metadata={
+            "description": "Largest bound on the error of the time of exposure, half of an echo's time [s]; "
+            "frames are not used before it is reached",
+            "range": (1e-5, 0.1),
+        },
+    )
+    up_axis: str = field(
+        default="y", metadata={"description": "Axis that points up in Motive's stream", "choices": UP_AXES}
+    )
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+
+class NatNetClient:
+    """Receives frames from Motive; a `BodySource`. Never blocks for longer than asked to.
+
+    `ros_now` gives the time of ROS [ns]; stamps follow it when it steps. Raises PerceptionError for an
+    address that is none or that this machine does not have.
+    """
+
+    def __init__(
+        self, parameters: NatNetParameters | None = None, ros_now: Callable[[], int] = time.time_ns
+    ) -> None:
+        self.parameters = parameters or NatNetParameters()
+        self._ros_now = ros_now
+        server = _resolved(self.parameters.server_address)
+        self._server = (server, self.parameters.command_port)
+        self.session = NatNetSession(
+            server, up_axis=self.parameters.up_axis, max_clock_error=self.parameters.max_clock_error
+        )
+        self._local = self.parameters.local_address or _route_to(self._server)
+        self._command = _udp_socket((self._local, 0))
+        self._data: socket.socket | None = None
+        self._group: tuple[str, int] | None = None
+        self._send_fault = ""
+        if self.parameters.transmission == "multicast":
+            self._join((self.parameters.multicast_address, self.parameters.data_port))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
+        """Return the frames that came since the last call; waits up to `timeout` [s] for the first."""
+        end = time.monotonic() + timeout
+        while True:
+            self._send_due()
+            left = end - time.monotonic()
+            frames = self._receive(max(0.0, min(left, STEP)))
+            if frames or left <= 0.0:
+                return frames
+
+    def status(self) -> SourceStatus:
+        """Return how the connection fares, in plain words."""
+        status = self.session.status(time.monotonic_ns())
+        if self._send_fault and not status.ok:
+            return SourceStatus(False, f"{status.words}; sending fails: {self._send_fault}", status.values)
+        return status
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._command.close()
+        if self._data is not None:
+            self._data.close()
+
+    def _send_due(self) -> None:
+        for request in self.session.outgoing(time.monotonic_ns()):
+            try:
+                self._command.sendto(request, self._server)
+                self._send_fault = ""
+            except OSError as error:
+                # The network may come back; until then the status tells.
+                self._send_fault = error.strerror or str(error)
+
+    def _receive(self, timeout: float) -> list[BodyFrame]:
+        sockets = [self._command] if self._data is None else [self._command, self._data]
+        readable, _, _ = select.select(sockets, [], [], timeout)
+        frames = []
+        for ready in readable:
+            for _ in range(MAX_PACKETS):
+                try:
+                    data, sender = ready.recvfrom(MAX_PACKET_BYTES)
+                except BlockingIOError:
+                    break
+                except OSError:
+                    # On Linux a request to a closed port fails the next read; the session retries.
+                    continue
+                arrival_ns = time.monotonic_ns()
+                frame = self.session.receive(data, sender, arrival_ns, self._ros_offset_ns())
+                if frame is not None:
+                    frames.append(frame)
+        self._follow_transmission()
+        return frames
+
+    def _ros_offset_ns(self) -> int:
+        """Time of ROS minus monotonic time, by the reading that was interrupted least."""
+        readings = []
+        for _ in range(3):
+            before = time.monotonic_ns()
+            ros = self._ros_now()
+            after = time.monotonic_ns()
+            readings.append((after - before, ros - (before + after) // 2))
+        return min(readings)[1]
+
+    def _follow_transmission(self) -> None:
+        """Listen to the multicast group that the server tells, if it sends that way."""
+        info = self.session.info
+        if self.parameters.transmission != "auto" or info is None:
+            return
+        if info.multicast and info.multicast_address and info.data_port:
+            self._join((info.multicast_address, info.data_port))
+
+    def _join(self, group: tuple[str, int]) -> None:
+        if group == self._group:
+            return
+        self._group = group
+        if self._data is not None:
+            self._data.close()
+            self._data = None
+        try:
+            self._data = _udp_socket(group, shared=True)
+            membership = socket.inet_aton(group[0]) + socket.inet_aton(self._local)
+            self._data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        except (OSError, PerceptionError) as error:
+            self._send_fault = f"multicast {group[0]}:{group[1]} cannot be joined: {error}"
+
+
+def _resolved(address: str) -> str:
+    try:
+        return socket.gethostbyname(address)
+    except OSError:
+        raise PerceptionError(f"server_address '{address}' is no address that is known here") from None
+
+
+def _route_to(server: tuple[str, int]) -> str:
+    """Address of the interface from which packets to the server leave."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(server)
+        except OSError:
+            return "0.0.0.0"
+        return str(probe.getsockname()[0])
+
+
+def _udp_socket(address: tuple[str, int], *, shared: bool = False) -> socket.socket:
+    result = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        result.setblocking(False)
+        result.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if shared:
+            result.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        result.bind(address)
+    except OSError as error:
+        result.close()
+        reason = error.strerror or str(error)
+        raise PerceptionError(f"this machine has no interface {address[0]}:{address[1]} ({reason})") from None
+    return result

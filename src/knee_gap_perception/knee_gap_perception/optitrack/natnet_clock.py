@@ -1,0 +1,89 @@
+"""The server's clock on ours: echoes bound when its ticks were; the best give offset and rate."""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+NANOSECONDS = 1_000_000_000
+
+# Two crystals differ by no more than this share; over the time after which the rate is fitted [ns], 0.6 ms.
+MAX_DRIFT = 2e-4
+RATE_KNOWN_AFTER_NS = 3 * NANOSECONDS
+# Without an echo for so long the clock is no longer trusted [ns].
+MAX_AGE_NS = 60 * NANOSECONDS
+# An echo that is this far outside of what the clock says means another clock: the server restarted [ns].
+RESTART_NS = 2_000_000
+
+
+class Echo(NamedTuple):
+    """The server's ticks were read at `local_ns`, give or take `error_ns`: half the time of the echo."""
+
+    ticks: int
+    local_ns: int
+    error_ns: float
+
+
+class EchoClock:
+    """Maps ticks of the server's clock to the local monotonic clock [ns].
+
+    Each echo encloses the moment at which the server read its clock. Echoes that took little longer than the
+    quickest one are kept; a straight line through their middles gives offset and rate.
+    """
+
+    def __init__(self, frequency: int, max_error_ns: float = 1_000_000) -> None:
+        self.frequency = frequency
+        self.max_error_ns = max_error_ns
+        self.restart_count = 0
+        self._echoes: deque[Echo] = deque(maxlen=120)
+        self._origin: Echo | None = None
+        self._ns_per_tick = NANOSECONDS / frequency
+        self._error_ns = float("inf")
+
+    @property
+    def error_ns(self) -> float:
+        """Bound on the error of the offset [ns]: half of the quickest echo; infinite before any."""
+        return self._error_ns
+
+    def ready(self, now_ns: int) -> bool:
+        """Whether ticks can be mapped to within `max_error_ns`: by three echoes, the last not long ago."""
+        enough = len(self._echoes) >= 3 and self._error_ns <= self.max_error_ns
+        return enough and now_ns - self._echoes[-1].local_ns <= MAX_AGE_NS
+
+    def add(self, sent_ns: int, received_ns: int, ticks: int) -> None:
+        """Take an echo that was sent and received at these local times."""
+        if received_ns < sent_ns:
+            return
+        echo = Echo(ticks, (sent_ns + received_ns) // 2, (received_ns - sent_ns) / 2)
+        if self._origin is not None:
+            off = abs(self.local_ns(ticks) - echo.local_ns)
+            if off > echo.error_ns + self._error_ns + RESTART_NS:
+                self.restart_count += 1
+                self._echoes.clear()
+                self._ns_per_tick = NANOSECONDS / self.frequency
+        self._echoes.append(echo)
+        self._fit()
+
+    def local_ns(self, ticks: int) -> int:
+        """Local time of a tick; `ready` must hold, or at least one echo be known."""
+        assert self._origin is not None
+        return self._origin.local_ns + round((ticks - self._origin.ticks) * self._ns_per_tick)
+
+    def _fit(self) -> None:
+        latest = self._echoes[-1].local_ns
+        best = min(self._echoes, key=lambda echo: echo.error_ns)
+        # An echo that took longer was delayed on one of its two ways, and its middle is off by that.
+        quick = [echo for echo in self._echoes if echo.error_ns <= 1.5 * best.error_ns + 20_000]
+        if quick[-1].local_ns - quick[0].local_ns < RATE_KNOWN_AFTER_NS:
+            recent = [echo for echo in self._echoes if latest - echo.local_ns < RATE_KNOWN_AFTER_NS]
+            self._origin = min(recent, key=lambda echo: echo.error_ns)
+            self._error_ns = self._origin.error_ns
+            return
+        newest, nominal = quick[-1], NANOSECONDS / self.frequency
+        ticks = np.array([echo.ticks - newest.ticks for echo in quick], dtype=np.float64)
+        local = np.array([echo.local_ns - newest.local_ns for echo in quick], dtype=np.float64)
+        slope = float(np.polyfit(ticks, local, 1)[0])
+        self._ns_per_tick = min(max(slope, nominal * (1 - MAX_DRIFT)), nominal * (1 + MAX_DRIFT))
+        offset = float(np.mean(local - self._ns_per_tick * ticks))
+        self._origin = newest._replace(local_ns=newest.local_ns + round(offset))
+        self._error_ns = best.error_ns

@@ -1,0 +1,190 @@
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.optitrack.body_source import choose_body
+from knee_gap_perception.optitrack.natnet_client import NatNetClient, NatNetParameters
+from knee_gap_perception.pose_validity import RefusalReason
+from knee_gap_perception.poses import LensPose
+from knee_gap_perception.tracking import ScopeTracker
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.natnet_server import NatNetServer, ServerSettings, main
+from knee_gap_simulation.natnet_server_packets import VERSIONS
+from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, Faults, TrackedScene
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Served:
+    """A server that runs in a thread while the test talks to it."""
+
+    def __init__(self, *, names=("scope", "tibia", "clock"), faults=None, **settings):
+        self.port = free_port()
+        self.scene = TrackedScene(names, faults or Faults())
+        self.server = NatNetServer(self.scene, ServerSettings(command_port=self.port, **settings))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self):
+        with self.server:
+            while not self._stop.is_set():
+                self.server.step(0.01)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+
+
+def collect(client, seconds):
+    frames, end = [], time.monotonic() + seconds
+    while time.monotonic() < end:
+        frames += client.poll(0.02)
+    return frames
+
+
+def stamp_errors(frames):
+    """How far each stamp is from the time that the clock body shows [s]."""
+    shown = np.array([choose_body(frame, "clock")[0].position[0] for frame in frames]) * CLOCK_SECONDS
+    stamps = np.array([frame.stamp_ns % (CLOCK_SECONDS * 1e9) / 1e9 for frame in frames])
+    return (stamps - shown + CLOCK_SECONDS / 2) % CLOCK_SECONDS - CLOCK_SECONDS / 2
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_frames_come_by_unicast_with_the_time_of_exposure(version):
+    with (
+        Served(version=version, rate=120.0, latency=0.02) as served,
+        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+    ):
+        frames = collect(client, 1.5)
+        status = client.status()
+    assert len(frames) > 100
+    assert status.ok, status.words
+    # Half of a processor's time slice is lost to other tests now and then; the latency of 20 ms would show.
+    assert np.median(np.abs(stamp_errors(frames))) < 0.001
+
+
+def test_frames_come_by_multicast_that_the_server_tells():
+    port = free_port()
+    with (
+        Served(multicast_address="239.255.42.88", data_port=port, rate=120.0) as served,
+        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+    ):
+        frames = collect(client, 1.5)
+        if not frames and "cannot be joined" in client.status().words:
+            pytest.skip("no multicast on the loopback of this machine")
+    assert len(frames) > 100
+
+
+def test_poses_are_those_of_the_scene_turned_to_z_up():
+    with Served(rate=120.0) as served, NatNetClient(NatNetParameters(command_port=served.port)) as client:
+        frames = collect(client, 1.0)
+    frame = frames[-1]
+    position, _ = served.scene.true_pose(1, frame.stamp_ns / 1e9)
+    x, y, z = position
+    np.testing.assert_allclose(choose_body(frame, "scope")[0].position, [x, -z, y], atol=3e-4)
+
+
+def test_no_hidden_or_swapped_pose_is_published():
+    faults = Faults(
+        lost_share=0.01,
+        invalid_share=0.02,
+        occlusion_period=0.7,
+        occlusion_length=0.2,
+        swap_period=1.1,
+        swap_length=0.3,
+    )
+    tracker, worst, accepted = ScopeTracker(), 0.0, 0
+    with (
+        Served(faults=faults, rate=240.0) as served,
+        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+    ):
+        for frame in collect(client, 4.0):
+            body, others = choose_body(frame, "scope")
+            if isinstance(tracker.update(body, others), LensPose):
+                x, y, z = served.scene.true_pose(1, frame.stamp_ns / 1e9)[0]
+                worst = max(worst, float(np.linalg.norm(body.position - [x, -z, y])))
+                accepted += 1
+    assert accepted > 150
+    assert worst < 1e-3
+    counts = tracker.validity.counts
+    assert counts[RefusalReason.NOT_TRACKED] > 10
+    assert counts[RefusalReason.SWAPPED] > 10
+
+
+def test_a_restart_is_survived_with_right_stamps():
+    with (
+        Served(rate=120.0, restart_period=1.5, down_time=2.5) as served,
+        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+    ):
+        before = collect(client, 1.4)
+        after = collect(client, 5.0)
+    assert served.server.counts.restarts >= 1
+    assert len(before) > 80
+    gap = np.diff([frame.stamp_ns for frame in after]).max() / 1e9
+    assert 2.4 < gap < 5.0
+    assert (np.diff([frame.stamp_ns for frame in before + after]) > 0).all()
+    assert np.median(np.abs(stamp_errors(after))) < 0.001
+
+
+def test_without_a_server_the_client_waits_and_says_why():
+    with NatNetClient(NatNetParameters(command_port=free_port())) as client:
+        assert collect(client, 0.5) == []
+        status = client.status()
+    assert not status.ok
+    assert "no answer from 127.0.0.1" in status.words
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"server_address": "no.such.host.invalid"}, "server_address 'no.such.host.invalid' is no address"),
+        ({"local_address": "192.0.2.1"}, "no interface 192.0.2.1"),
+        ({"transmission": "broadcast"}, "must be one of auto, unicast, multicast"),
+        ({"up_axis": "x"}, "must be one of y, z"),
+        ({"command_port": 0}, r"command_port must lie in \[1, 65535\], not 0"),
+    ],
+)
+def test_settings_of_the_client(values, message):
+    with pytest.raises(PerceptionError, match=message):
+        NatNetClient(NatNetParameters(**values))
+
+
+def test_the_server_binds_to_the_loopback_only():
+    with Served() as served:
+        assert served.server._command.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_port_that_is_taken_is_one_line(capsys):
+    with Served() as served, pytest.raises(SystemExit) as ended:
+        main(["--command-port", str(served.port)])
+    assert ended.value.code != 0
+    error = capsys.readouterr().err.strip()
+    assert "cannot be used" in error
+    assert "\n" not in error
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--version", "2.7"], ["--version", "x"], ["--lose", "2"], ["--rate", "0"]]
+)
+def test_mistakes_on_the_command_line_are_one_line(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code != 0
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_bodies_need_names_that_differ():
+    with pytest.raises(SimulationError, match="names that differ"):
+        TrackedScene(("scope", "scope"))
