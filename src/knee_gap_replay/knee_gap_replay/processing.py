@@ -36,8 +36,13 @@ class Pipeline(Protocol):
     `outputs` are the topics it publishes, with their types and quality of service.
     """
 
-    inputs: Sequence[str]
-    outputs: Mapping[str, tuple[str, QosName]]
+    @property
+    def inputs(self) -> Sequence[str]:
+        """Topics."""
+
+    @property
+    def outputs(self) -> Mapping[str, tuple[str, QosName]]:
+        """Type and quality of service of each topic."""
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
         """Take one message and return what follows from it."""

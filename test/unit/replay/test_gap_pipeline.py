@@ -1,0 +1,142 @@
+"""The pipeline of a bag: the tracked body and the edges of two known points give their known distance."""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from knee_gap_perception.edge_stream import EdgeStream
+from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_replay.pipeline import GapPipeline
+from knee_gap_replay.processing import Output
+from knee_gap_replay.topics import InputTopics
+from knee_gap_replay.types import blank
+from knee_gap_uncertainty.estimator import GapEstimator
+
+Array = npt.NDArray[np.float64]
+
+TOPICS = InputTopics("/image", "/camera_info", "/body")
+POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
+GAP = float(np.linalg.norm(POINTS[0] - POINTS[1]))
+POSE_PERIOD_NS = 8_333_333
+TRACKING = TrackingParameters(body_to_shaft_translation=(0.0, 0.01, 0.2), oblique_angle=0.5)
+VALID, TRACKING_LOST, INSUFFICIENT_PARALLAX = 1, 3, 4
+
+
+def lens_pose(stamp_ns: int) -> Array:
+    """Lens moving 2 mm a second along x, turning slowly."""
+    seconds = stamp_ns * 1e-9
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.02 * seconds, 0.05 * seconds, 0.1]).as_matrix()
+    T[:3, 3] = [0.002 * seconds, 0.0, 0.0001 * seconds]
+    return T
+
+
+class TrueEdges:
+    """Stands for the segmentation: it knows where the two points are."""
+
+    def __init__(self) -> None:
+        self.camera_seen = False
+
+    def on_camera_info(self, message: Any) -> None:
+        self.camera_seen = True
+
+    def on_image(self, message: Any) -> GapEdges:
+        assert self.camera_seen
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        T = lens_pose(stamp_ns)
+        bearings = (POINTS - T[:3, 3]) @ T[:3, :3]
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        nothing = GapEdges.without_points(stamp_ns, "arthroscope_optical", EdgeStatus.VALID, track_id=1)
+        planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
+        return replace(
+            nothing,
+            bearings=bearings,
+            kinds=(EdgeKind.RIM, EdgeKind.RIM),
+            covariances=planes * 1e-6,
+            angular_error=3e-3,
+        )
+
+
+def stamped(msgtype: str, stamp_ns: int) -> Any:
+    message = blank(msgtype)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    return message
+
+
+def body(stamp_ns: int) -> Any:
+    message = stamped("geometry_msgs/msg/PoseStamped", stamp_ns)
+    T = lens_pose(stamp_ns) @ np.linalg.inv(TRACKING.body_to_lens())
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, p.z = (float(value) for value in T[:3, 3])
+    q.x, q.y, q.z, q.w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat())
+    return message
+
+
+def run(end_ns: int, poses_until_ns: int) -> list[Output]:
+    pipeline = GapPipeline(
+        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
+    )
+    outputs = list(pipeline.feed("/camera_info", stamped("sensor_msgs/msg/CameraInfo", 0), 0))
+    for index in range(end_ns // POSE_PERIOD_NS):
+        stamp_ns = index * POSE_PERIOD_NS
+        if stamp_ns <= poses_until_ns:
+            outputs += pipeline.feed("/body", body(stamp_ns), stamp_ns)
+        if index % 2 == 0:
+            image_ns = stamp_ns + 1_000_000
+            outputs += pipeline.feed("/image", stamped("sensor_msgs/msg/CompressedImage", image_ns), image_ns)
+    return [*outputs, *pipeline.finish()]
+
+
+def on(outputs: list[Output], topic: str) -> list[Any]:
+    return [output.message for output in outputs if output.topic == topic]
+
+
+def test_the_known_distance_comes_out_once_the_scope_has_moved() -> None:
+    outputs = run(3_000_000_000, 3_000_000_000)
+    gaps = on(outputs, "/space/gap")
+    assert len(gaps) == len(on(outputs, "/space/gap_edges")) == 180
+    valid = [gap for gap in gaps if gap.status == VALID]
+    assert len(valid) > 90
+    assert all(gap.gap_min < GAP < gap.gap_max for gap in valid)
+    assert valid[-1].gap == pytest.approx(GAP, rel=0.02)
+    assert gaps[1].status == INSUFFICIENT_PARALLAX
+
+
+def test_plain_numbers_repeat_the_valid_estimates_and_no_others() -> None:
+    outputs = run(3_000_000_000, 3_000_000_000)
+    valid = [gap for gap in on(outputs, "/space/gap") if gap.status == VALID]
+    for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr")):
+        assert [m.data for m in on(outputs, f"/space/gap/{topic}")] == [getattr(gap, name) for gap in valid]
+
+
+def test_lens_poses_are_those_of_the_body_with_the_lens_on_it() -> None:
+    outputs = run(500_000_000, 500_000_000)
+    for pose in on(outputs, "/space/scope_pose"):
+        stamp_ns = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
+        p = pose.pose.pose.position
+        np.testing.assert_allclose([p.x, p.y, p.z], lens_pose(stamp_ns)[:3, 3], atol=1e-12)
+
+
+def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
+    """As live: an image whose next pose does not come within the allowed wait is said to be lost."""
+    outputs = run(3_000_000_000, 2_000_000_000)
+    gaps = on(outputs, "/space/gap")
+    assert len(gaps) == 180
+    for gap in gaps:
+        stamp_ns = gap.header.stamp.sec * 10**9 + gap.header.stamp.nanosec
+        if stamp_ns > 2_000_000_000:
+            assert gap.status == TRACKING_LOST
+
+
+def test_every_output_is_announced_with_its_type() -> None:
+    pipeline = GapPipeline(
+        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
+    )
+    outputs = run(2_500_000_000, 2_500_000_000)
+    assert {o.topic for o in outputs} == set(pipeline.outputs)
+    assert all(o.message.__msgtype__ == pipeline.outputs[o.topic][0] for o in outputs)

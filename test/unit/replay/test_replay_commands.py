@@ -1,0 +1,107 @@
+"""process and check as a user meets them: one line for a mistake, and exit codes that a script can use."""
+
+from pathlib import Path
+
+import pytest
+
+from knee_gap_replay import check, process
+from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_replay.types import blank
+
+IMAGE, INFO, POSE = "/knee_gap/image_raw/compressed", "/knee_gap/camera_info", "/knee_gap/scope_body/pose"
+
+
+def write(path: Path, *, pose_from_ms: int = 0, skip: str = "") -> Path:
+    """Write a second of empty images at 50 Hz with poses at 100 Hz."""
+    with BagWriter(path) as bag:
+        for topic, msgtype, period_ms, begin_ms in (
+            (IMAGE, "sensor_msgs/msg/CompressedImage", 20, 10),
+            (INFO, "sensor_msgs/msg/CameraInfo", 20, 10),
+            (POSE, "geometry_msgs/msg/PoseStamped", 10, pose_from_ms),
+        ):
+            if topic == skip:
+                continue
+            bag.add_topic(topic, msgtype, "sensor")
+            for stamp_ms in range(begin_ms, 1000, period_ms):
+                message = blank(msgtype)
+                message.header.stamp.nanosec = stamp_ms * 1_000_000
+                bag.write(topic, message, (stamp_ms + 5) * 1_000_000)
+    return path
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the one line on stderr."""
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    return error
+
+
+def test_process_of_empty_images_says_so_for_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert process.main([str(write(tmp_path / "bag")), str(out)]) == 0
+    assert "50 /knee_gap/gap_edges" in capsys.readouterr().out
+    with BagReader(out) as reader:
+        statuses = [reader.deserialize(m).status for m in reader.messages(["/knee_gap/gap"])]
+        assert reader.topics["/knee_gap/gap/snr"] == "std_msgs/msg/Float64"
+        assert not list(reader.messages(["/knee_gap/gap/min"]))
+    no_edges = 2
+    assert statuses == [no_edges] * 50
+
+
+def test_process_refuses_mistakes_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = str(write(tmp_path / "bag"))
+    poor = str(write(tmp_path / "poor", skip=INFO))
+    out = str(tmp_path / "out")
+    assert process.main([str(tmp_path / "nothing"), out]) == 1
+    assert "does not exist" in told(capsys)
+    assert process.main([poor, out]) == 1
+    assert f"has no topic {INFO}; it has " in told(capsys)
+    assert process.main([bag, bag]) == 1
+    assert "exists already" in told(capsys)
+    assert process.main([bag, out, "--pose", "/other"]) == 1
+    assert "has no topic /other" in told(capsys)
+    parameters = tmp_path / "params.yaml"
+    parameters.write_text("tracking_node:\n  ros__parameters:\n    oblique_angel: 0.5\n")
+    assert process.main([bag, out, "--params-file", str(parameters)]) == 1
+    assert "no parameter oblique_angel of tracking_node" in told(capsys)
+    assert not Path(out).exists()
+    with pytest.raises(SystemExit, match="2"):
+        process.main([bag])
+    assert "required: OUT" in told(capsys)
+
+
+def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert check.main([str(write(tmp_path / "bag"))]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2:] == ["complete and undamaged", "usable"]
+    assert any(POSE in line and "100.0 Hz" in line and "latency 5.0 ms" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("pose_from_ms", "skip", "reason"),
+    [
+        (0, POSE, f"not usable: nothing readable on {POSE}"),
+        (0, IMAGE, f"not usable: nothing readable on {IMAGE}"),
+        (500, "", "not usable: only 50% of the images lie between poses at most 25 ms away"),
+    ],
+)
+def test_check_tells_why_a_bag_cannot_be_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], pose_from_ms: int, skip: str, reason: str
+) -> None:
+    assert check.main([str(write(tmp_path / "bag", pose_from_ms=pose_from_ms, skip=skip))]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == reason
+
+
+def test_check_tells_damage_and_judges_by_what_is_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = (write(tmp_path / "bag") / "bag.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
+    assert check.main([str(tmp_path / "cut.mcap")]) == 1
+    assert "1 damaged or missing parts" in capsys.readouterr().out
+
+
+def test_check_refuses_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "x.mcap").write_text("not a bag, but long enough to look at")
+    assert check.main([str(tmp_path / "x.mcap")]) == 1
+    assert "is not an MCAP file" in told(capsys)
