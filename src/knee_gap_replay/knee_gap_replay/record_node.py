@@ -10,6 +10,7 @@ from functools import partial
 
 import rclpy
 from rclpy.clock import ROSClock
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -17,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import remove_ros_args
+from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 
 from knee_gap_node.parameters import refuse_unknown
@@ -40,7 +42,7 @@ class RecordNode(Node):
         super().__init__("record")
         refuse_unknown(self, self._parameter_overrides)
         self._writer = writer
-        self._wanted = [self.resolve_topic_name(topic) for topic in dict.fromkeys(topics)]
+        self._wanted = [self._resolved(topic) for topic in dict.fromkeys(topics)]
         self._refused: set[str] = set()
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._profiles: dict[str, QoSProfile] = {}
@@ -72,6 +74,13 @@ class RecordNode(Node):
                 self._refused.add(topic)
                 _LOG.warning("%s is not recorded: %s", topic, error)
 
+    def _resolved(self, topic: str) -> str:
+        try:
+            validate_topic_name(topic)
+        except InvalidTopicNameException:
+            raise BagError(f"'{topic}' is not a topic name") from None
+        return str(self.resolve_topic_name(topic))
+
     def _subscribe(self, topic: str, publishers: Sequence[TopicEndpointInfo], profile: QoSProfile) -> None:
         msgtype = known_type(publishers[0].topic_type)
         kind = message_class(msgtype)
@@ -80,6 +89,7 @@ class RecordNode(Node):
         self._subscriptions_by_topic[topic] = self.create_subscription(
             kind, topic, partial(self._keep, topic, msgtype), profile, raw=True
         )
+        print(f"record: {topic} ({msgtype})", flush=True)
 
     def _keep(self, topic: str, msgtype: str, data: bytes, info: Mapping[str, int | None]) -> None:
         self._count_lost(topic, info.get("publication_sequence_number"))
@@ -124,10 +134,11 @@ def _offered(publisher: TopicEndpointInfo) -> Qos:
 
 def _run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
-    with BagWriter(arguments.out) as bag:
-        writer = WriterThread(bag)
+    bag = BagWriter(arguments.out)
+    writer = WriterThread(bag)
+    node = RecordNode(arguments.topics, writer)
+    with bag:
         writer.start()
-        node = RecordNode(arguments.topics, writer)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         end = time.monotonic() + (arguments.duration or float("inf"))
