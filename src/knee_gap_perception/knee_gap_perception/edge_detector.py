@@ -25,10 +25,9 @@ Mask = npt.NDArray[np.bool_]
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
 OVEREXPOSED_SHARE = 0.7  # of the field
-DARK_SHARE = 0.35  # of the way from gap to tissue, below which a pixel is the gap
 
 
-class _NoPoints(Exception):
+class _NoPointsError(Exception):
     """Why an image gives no points."""
 
     def __init__(self, status: EdgeStatus, reason: str) -> None:
@@ -93,15 +92,15 @@ class GapEdgeDetector:
     ) -> GapEdges:
         """The edges in an image (h, w, 3), blue green red, or (h, w) grey, exposed at a stamp [ns].
 
-        `lens_pose` is the pose of the lens at that stamp where it is known. It foretells where the points are,
-        through whatever hides them; where they are seen the image decides.
+        `lens_pose` is the pose of the lens at that stamp where it is known. It foretells where the points
+        are, through whatever hides them; where they are seen the image decides.
         """
         try:
             picture = self._checked(stamp_ns, image, camera)
             view = View.of(lens_pose) if lens_pose is not None else None
             edges = self._points(stamp_ns, picture, camera, view, frame_id)
             self._reason = ""
-        except _NoPoints as refusal:
+        except _NoPointsError as refusal:
             self._reason = str(refusal)
             track_id = self._track.track_id if self._track is not None else 0
             edges = GapEdges.without_points(stamp_ns, frame_id, refusal.status, track_id)
@@ -119,7 +118,7 @@ class GapEdgeDetector:
         if field is None:
             return np.zeros(shape, np.uint8)
         small, scale = self._working_size(self._image)
-        dark = self._segmentation(small, field.mask(small.shape[:2], scale))
+        dark = self._segmentation(small, field.mask((small.shape[0], small.shape[1]), scale))
         full = cv2.resize(dark.astype(np.uint8) * 255, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
 
@@ -152,7 +151,7 @@ class GapEdgeDetector:
         return picture
 
     def _refuse(self, reason: str) -> None:
-        raise _NoPoints(EdgeStatus.UNKNOWN, reason)
+        raise _NoPointsError(EdgeStatus.UNKNOWN, reason)
 
     def _check_frozen(self, picture: Image) -> None:
         # Noise makes every image of a live camera differ, even of a scene that does not move.
@@ -161,7 +160,7 @@ class GapEdgeDetector:
         self._thumbnail = thumbnail
         self._identical = self._identical + 1 if same else 0
         if self._identical + 1 >= self.parameters.frozen_images:
-            raise _NoPoints(
+            raise _NoPointsError(
                 EdgeStatus.UNKNOWN, f"the video is frozen: {self._identical + 1} identical images"
             )
 
@@ -171,7 +170,9 @@ class GapEdgeDetector:
         field = self._finder.find(picture)
         if field is None:
             self.end_track()
-            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is too dark to find the field of view in")
+            raise _NoPointsError(
+                EdgeStatus.LOW_CONTRAST, "the picture is too dark to find the field of view in"
+            )
         grey = np.asarray(cv2.extractChannel(picture, 1), np.uint8)
         if self._track is None:
             sightings = self._start(stamp_ns, picture, grey, camera, view, field)
@@ -193,39 +194,39 @@ class GapEdgeDetector:
         coarseness = camera.radians_per_pixel(section.centre)
         points = choose_points(grey, section, field, self.parameters.inset / coarseness)
         if points is None:
-            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the tissue beside the gap has no texture to follow")
-        dark_below = section.levels[0] + DARK_SHARE * (section.levels[1:] - section.levels[0])
-        tracks = tuple(
-            PointTrack(grey, point.pixel, float(dark), camera, view)
-            for point, dark in zip(points, dark_below, strict=True)
-        )
+            raise _NoPointsError(
+                EdgeStatus.LOW_CONTRAST, "the tissue beside the gap has no texture to follow"
+            )
+        first, second = (PointTrack(grey, point.pixel, point.dark_below, camera, view) for point in points)
         self._tracks += 1
         self._clicked = None
         self._seen_ns = stamp_ns
-        self._track = _Track(self._tracks, (tracks[0], tracks[1]), (EdgeKind.UNKNOWN, EdgeKind.UNKNOWN))
-        return [track.first for track in tracks]
+        self._track = _Track(self._tracks, (first, second), (EdgeKind.UNKNOWN, EdgeKind.UNKNOWN))
+        return [first.first, second.first]
 
     def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:
-        """The section of the gap; raises _NoPoints where the picture shows none."""
+        """The section of the gap; raises _NoPointsError where the picture shows none."""
         small, scale = self._working_size(picture)
-        inside = field.mask(small.shape[:2], scale, self.parameters.field_margin * field.extent)
+        inside = field.mask(
+            (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
+        )
         value = brightness(small)
         self._check_light(value[inside])
         dark = self._segmentation(small, inside)
         section = find_section(dark, value, field, scale, self._region(field))
         if section is None:
-            raise _NoPoints(
+            raise _NoPointsError(
                 EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
             )
         width = float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
         if not width >= self.parameters.minimum_width:
-            raise _NoPoints(
+            raise _NoPointsError(
                 EdgeStatus.NO_GAP,
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
         if section.contrast.min() < self.parameters.minimum_contrast:
-            raise _NoPoints(
+            raise _NoPointsError(
                 EdgeStatus.NO_GAP,
                 f"the dark part is shaded tissue: contrast {section.contrast.min():.2f}, a gap has at least "
                 f"{self.parameters.minimum_contrast:.2f}",
@@ -234,9 +235,9 @@ class GapEdgeDetector:
 
     def _check_light(self, values: Image) -> None:
         if values.size == 0 or np.percentile(values, 95) < DARK_PICTURE:
-            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
+            raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
         if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
-            raise _NoPoints(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+            raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
 
     def _region(self, field: FieldOfView) -> tuple[Array, float]:
         """Centre and radius [px] of the region of interest."""
@@ -266,12 +267,12 @@ class GapEdgeDetector:
             raise self._ended(EdgeStatus.LOW_CONTRAST, "a point was hidden for too long")
         return sightings
 
-    def _ended(self, status: EdgeStatus, reason: str) -> _NoPoints:
+    def _ended(self, status: EdgeStatus, reason: str) -> _NoPointsError:
         self.end_track()
-        return _NoPoints(status, reason)
+        return _NoPointsError(status, reason)
 
     def _edges(self, stamp_ns: int, frame_id: str, camera: Camera, sightings: list[Sighting]) -> GapEdges:
-        """The message's values; raises _NoPoints where the points are not known well enough."""
+        """The message's values; raises _NoPointsError where the points are not known well enough."""
         assert self._track is not None
         pixels = np.stack([sighting.position for sighting in sightings])
         bearings = camera.bearings(pixels)
@@ -287,7 +288,7 @@ class GapEdgeDetector:
         worst = max(float(np.linalg.eigvalsh(covariance)[-1]) for covariance in covariances)
         angular_error = self.parameters.error_factor * float(np.sqrt(worst))
         if angular_error > self.parameters.maximum_angular_error:
-            raise _NoPoints(
+            raise _NoPointsError(
                 EdgeStatus.LOW_CONTRAST,
                 f"a point is known to {np.degrees(angular_error):.2f} deg only, needed are "
                 f"{np.degrees(self.parameters.maximum_angular_error):.2f} deg",

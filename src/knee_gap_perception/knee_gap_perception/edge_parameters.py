@@ -43,7 +43,7 @@ class EdgeParameters:
     region_centre: tuple[float, ...] = field(
         default=(nan, nan),
         metadata={
-            "description": "Column and row of the region in which the section lies [px]; NaN: the field's centre",
+            "description": "Column and row of the region of the section [px]; NaN: the field's centre",
             "range": (0.0, 16384.0),
             "nan": True,
         },
@@ -62,7 +62,7 @@ class EdgeParameters:
     minimum_contrast: float = field(
         default=0.45,
         metadata={
-            "description": "Step of brightness over an edge, against the tissue's, below which it is no gap [-]",
+            "description": "Least step of brightness over an edge of a gap, against the tissue's [-]",
             "range": (0.05, 0.95),
         },
     )

@@ -28,7 +28,7 @@ DIFFERENCE = 4.0  # [px] between the points whose images give the shape
 
 @dataclass(frozen=True)
 class View:
-    """A lens: its pose in the world (4, 4) and the standard deviation of its position [m] and rotation [rad]."""
+    """A lens: its pose in the world (4, 4), and deviations of position [m] and rotation [rad]."""
 
     T_world_lens: Array
     position_error: float
@@ -47,7 +47,7 @@ class View:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A patch in a new image: its warp, the covariance (6, 6) of its parameters, and their change with m (6, 3)."""
+    """A patch in a new image: its warp, its parameters' covariance (6, 6) and change with m (6, 3)."""
 
     warp: Warp
     covariance: Array
@@ -67,7 +67,7 @@ class LocalPlane:
         ) / TYPICAL_DISTANCE**2
 
     def predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
-        """Where a patch of an earlier view is seen from a new one; None outside the camera's model."""
+        """Where a patch of an earlier view is seen from another; None outside the camera's model."""
         corners = anchor_pixel + DIFFERENCE * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
         bearings = camera.bearings(corners)
         step = 0.01 / TYPICAL_DISTANCE
@@ -86,7 +86,7 @@ class LocalPlane:
         return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian)
 
     def learn(self, prediction: Prediction, found: Array, covariance: Array) -> None:
-        """Take the registered parameters (6,) and their covariance (6, 6), the prediction being their prior."""
+        """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction."""
         gain = self.covariance @ prediction.jacobian.T @ np.linalg.inv(prediction.covariance)
         predicted = np.concatenate([prediction.warp.position, prediction.warp.shape.reshape(-1)])
         self.mean = self.mean + gain @ (found - predicted)

@@ -1,10 +1,11 @@
 """Registration of a small piece of surface from one image to another, by its texture.
 
 A patch is taken around a point of the surface, without its shading: brightness is taken against its local
-mean and contrast, so that a light that moves, its highlights and an exposure that adapts change little. Pixels that are not the surface (the gap,
-glare, the surround) have no weight. The patch is then found in another image under an affine warp
-pixel = position + shape q, q [px] counted from the point in the patch, by Gauss-Newton on the weighted squares
-(inverse compositional: Baker and Matthews 2004), held to a prediction by priors on position and shape.
+mean and contrast, so that a light that moves, its highlights and an exposure that adapts change little.
+Pixels that are not the surface (the gap, glare, the surround) have no weight. The patch is then found in
+another image under an affine warp pixel = position + shape q, q [px] counted from the point in the patch,
+by Gauss-Newton on the weighted squares (inverse compositional: Baker and Matthews 2004), held to a
+prediction by priors on position and shape.
 """
 
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ CONVERGED = 0.01  # [px]
 
 @dataclass(frozen=True)
 class Surface:
-    """Texture (h, w) [-] and weight (h, w) in [0, 1] of a crop; `origin` is the pixel of its first column, row."""
+    """Texture (h, w) [-] and weight (h, w) in [0, 1] of a crop whose first pixel is `origin`."""
 
     texture: Float32
     weight: Float32
@@ -49,8 +50,9 @@ class Warp:
 class Registration:
     """Where a patch was found.
 
-    `covariance` (6, 6) is that of position x, y [px] and shape xx, xy, yx, yy, from the image's noise and the
-    prior; `correlation` [-1, 1] is that of the textures, `seen` the share [0, 1] of the patch that was the surface.
+    `covariance` (6, 6) is that of position x, y [px] and shape xx, xy, yx, yy, from the image's noise and
+    the prior; `correlation` [-1, 1] is that of the textures, `seen` the share [0, 1] of the patch that was
+    the surface.
     """
 
     warp: Warp
@@ -67,7 +69,7 @@ def surface_around(
     dark_below: float,
     field_mask: npt.NDArray[np.bool_] | None = None,
 ) -> Surface:
-    """Texture and weight of the square of an image (h, w) around a pixel; outside the image there is no weight."""
+    """Texture and weight of the square around a pixel of an image (h, w); none outside the image."""
     column, row = int(np.floor(centre[0])) - half_size, int(np.floor(centre[1])) - half_size
     side = 2 * half_size + 1
     crop = np.zeros((side, side), np.uint8)
@@ -80,7 +82,9 @@ def surface_around(
         valid[inner] = 1 if field_mask is None else field_mask[top:bottom, left:right]
     smooth = cv2.GaussianBlur(crop, (3, 3), 0).astype(np.float32)
     surface = valid * ((smooth > dark_below) & (smooth < GLARE))
-    surface = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(np.float32)
+    # Outside the crop counts as no surface.
+    eroded = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=[0.0])
+    surface = eroded.astype(np.float32)
     window = (LOCAL_MEAN, LOCAL_MEAN)
     total = cv2.boxFilter(smooth * surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     count = cv2.boxFilter(surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
@@ -107,8 +111,8 @@ class Patch:
         seen = _sample(surface.weight, surface, identity, self._grid)
         q = self._grid
         window = np.exp(-(q**2).sum(axis=-1) / (2 * (0.55 * half_size) ** 2)).astype(np.float32)
-        self.window_sum = float(window.sum())
         self.weight = seen * window
+        self.coverage = float(self.weight.sum() / window.sum())
         dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
         dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
         x, y = q[..., 0], q[..., 1]
@@ -197,12 +201,12 @@ def _sample(values: Float32, surface: Surface, warp: Warp, grid: Float32) -> Flo
     side = grid.shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(
-        cv2.warpAffine(values, matrix, (side, side), flags=flags, borderValue=0), dtype=np.float32
+        cv2.warpAffine(values, matrix, (side, side), flags=flags, borderValue=[0.0]), dtype=np.float32
     )
 
 
 def _compose(warp: Warp, step: Array) -> Warp:
-    """warp o step^-1, the inverse compositional update; a shape never changes by more than a third at once."""
+    """Warp o step^-1, the inverse compositional update; the shape changes by a third at most."""
     change = np.eye(2) + np.clip(step[2:].reshape(2, 2), -0.3, 0.3)
     inverse = np.linalg.inv(change)
     return Warp(warp.position - warp.shape @ inverse @ step[:2], warp.shape @ inverse)

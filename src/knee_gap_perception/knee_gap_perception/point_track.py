@@ -1,11 +1,12 @@
 """One surface point, followed from image to image by the texture around it.
 
-The point is defined by the first image. Every later image is registered against a patch of an earlier one: the
-first image's as long as the surface looks alike, then a patch taken at a later image, whose own error it inherits.
-So the error grows with the number of patches handed on (a few over a travel), not with the number of images.
+The point is defined by the first image. Every later image is registered against a patch of an earlier one:
+the first image's as long as the surface looks alike, then a patch taken at a later image, whose own error
+it inherits. So the error grows with the number of patches handed on (a few over a travel), not with the
+number of images.
 
-Where the pose of the lens is known it foretells, with the surface's tangent plane, where the patch will be and
-what shape it will have; otherwise the last image and even motion do.
+Where the pose of the lens is known it foretells, with the surface's tangent plane, where the patch will be
+and what shape it will have; otherwise the last image and even motion do.
 """
 
 from dataclasses import dataclass
@@ -54,7 +55,8 @@ class Sighting:
 class _Anchor:
     """A patch and the image it came from: pixel (2,), view, shape (2, 2) against the first patch.
 
-    `covariance` (2, 2) [px^2] is that of the point in that image; `rest` counts images until it is tried again.
+    `covariance` (2, 2) [px^2] is that of the point in that image; `rest` counts images until it is tried
+    again.
     """
 
     patch: Patch

@@ -1,5 +1,6 @@
 """A segmentation strategy by its name."""
 
+from collections.abc import Callable
 from typing import Any
 
 from knee_gap_perception.errors import PerceptionError
@@ -17,13 +18,16 @@ def segmentation_named(name: str, **settings: Any) -> Segmentation:
     if name in ("otsu", "otsu3", "adaptive"):
         from knee_gap_perception.segmentation import thresholds
 
-        return {"otsu": thresholds.Otsu, "otsu3": thresholds.Otsu3, "adaptive": thresholds.Adaptive}[name](
-            **settings
-        )
+        thresholding: dict[str, Callable[..., Segmentation]] = {
+            "otsu": thresholds.Otsu,
+            "otsu3": thresholds.Otsu3,
+            "adaptive": thresholds.Adaptive,
+        }
+        return thresholding[name](**settings)
     if name in ("watershed", "chan_vese"):
         from knee_gap_perception.segmentation import regions
 
-        return {"watershed": regions.Watershed, "chan_vese": regions.ChanVese}[name](**settings)
+        return regions.Watershed(**settings) if name == "watershed" else regions.ChanVese(**settings)
     if name == "onnx":
         from knee_gap_perception.segmentation.network import Network
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.segmentation.strategy import Image, Mask
@@ -15,7 +16,8 @@ class Network:
     With one output channel a value above `threshold` is the gap; with several, the gap is where channel
     `gap_channel` is the largest. The input is (picture - mean) * scale per channel, in red, green, blue.
 
-    Raises PerceptionError for a file that is missing or that OpenCV cannot read, and for outputs of another shape.
+    Raises PerceptionError for a file that is missing or that OpenCV cannot read, and for outputs of another
+    shape.
     """
 
     def __init__(
@@ -46,21 +48,21 @@ class Network:
         picture = (cv2.cvtColor(resized, cv2.COLOR_BGR2RGB).astype(np.float32) - self._mean) * self._scale
         self._net.setInput(np.ascontiguousarray(picture.transpose(2, 0, 1)[None]))
         try:
-            output = np.asarray(self._net.forward())
+            output = np.asarray(self._net.forward(), np.float32)
         except cv2.error as error:
             raise PerceptionError(f"the network '{self._path}' does not run: {error.err}") from error
         score = self._gap_score(output)
         height, width = field.shape
         return np.asarray(field & (cv2.resize(score, (width, height), interpolation=cv2.INTER_LINEAR) > 0))
 
-    def _gap_score(self, output: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> np.ndarray:  # type: ignore[type-arg]
+    def _gap_score(self, output: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Score (h, w) of a network's output, above 0 where the gap is."""
         if output.ndim != 4 or output.shape[0] != 1 or not 0 <= self._gap_channel < max(output.shape[1], 2):
             raise PerceptionError(
-                f"the network's output must be (1, channels, height, width) with channel {self._gap_channel}, "
-                f"not {output.shape}"
+                "the network's output must be (1, channels, height, width) "
+                f"with channel {self._gap_channel}, not {output.shape}"
             )
         if output.shape[1] == 1:
-            return output[0, 0] - self._threshold
+            return np.asarray(output[0, 0] - np.float32(self._threshold))
         others = np.delete(output[0], self._gap_channel, axis=0).max(axis=0)
         return np.asarray(output[0, self._gap_channel] - others)

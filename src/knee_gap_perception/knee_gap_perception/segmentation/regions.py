@@ -23,7 +23,7 @@ class Watershed:
         markers = np.zeros(field.shape, np.int32)
         markers[field & (value <= 0.7 * threshold)] = 1
         markers[field & (value >= 1.3 * threshold + 4)] = 2
-        return np.asarray(watershed(gradient, markers, mask=field) == 1)
+        return np.asarray(watershed(gradient, markers, mask=field) == 1)  # type: ignore[no-untyped-call]
 
 
 class ChanVese:
@@ -43,7 +43,7 @@ class ChanVese:
         # field the level is that of lit tissue, so that no contour forms on the rim.
         level = np.minimum(value, np.percentile(value[field], 50)).astype(np.float64)
         level[~field] = np.percentile(value[field], 50)
-        grown = morphological_chan_vese(
+        grown = morphological_chan_vese(  # type: ignore[no-untyped-call]
             level, self._iterations, init_level_set=start.astype(np.int8), smoothing=self._smoothing
         )
         return np.asarray(field & (grown == 1))

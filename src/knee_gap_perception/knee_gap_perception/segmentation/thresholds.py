@@ -16,12 +16,14 @@ def otsu_threshold(values: npt.NDArray[np.uint8]) -> float:
 
 
 def otsu3_threshold(values: npt.NDArray[np.uint8]) -> float:
-    """The lower threshold of Otsu's three classes of values (n,); Otsu's own where there are fewer than three."""
+    """The lower of Otsu's two thresholds of values (n,); his single one where there are too few."""
     counts = np.bincount(values, minlength=256).astype(np.float64)
     if np.count_nonzero(counts) < 3:
         return otsu_threshold(values)
     used = np.flatnonzero(counts)
-    lower, _ = threshold_multiotsu(hist=(counts[used[0] : used[-1] + 1], np.arange(used[0], used[-1] + 1)))
+    lower, _ = threshold_multiotsu(  # type: ignore[no-untyped-call]
+        hist=(counts[used[0] : used[-1] + 1], np.arange(used[0], used[-1] + 1))
+    )
     return float(lower)
 
 

@@ -1,0 +1,127 @@
+"""The disc of the scope, drawn and real."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from knee_gap_perception.field_of_view import FieldOfViewFinder, find_field_of_view
+
+Image = npt.NDArray[np.uint8]
+
+
+def disc(
+    size: tuple[int, int],
+    centre: tuple[float, float],
+    radius: float,
+    level: float = 150.0,
+    surround: float = 3.0,
+) -> Image:
+    """A disc of tissue with a dark bar through it, on a noisy dark surround."""
+    rows, columns = np.mgrid[0 : size[1], 0 : size[0]]
+    inside = np.hypot(columns - centre[0], rows - centre[1]) < radius
+    image = np.where(inside, level, surround)
+    image[inside & (np.abs(rows - centre[1] - 0.2 * (columns - centre[0])) < 0.2 * radius)] = 0.08 * level
+    noise = np.random.default_rng(3).normal(0, 2, image.shape)
+    return np.repeat(np.clip(image + noise, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize(
+    ("size", "centre", "radius"),
+    [
+        ((1280, 720), (640, 360), 350),
+        ((1280, 720), (600, 380), 250),
+        ((1920, 1080), (995, 544), 527),
+        ((1280, 720), (640, 360), 480),  # cut by the frame above and below
+        ((720, 1280), (360, 640), 340),
+    ],
+)
+@pytest.mark.parametrize("level", [40.0, 150.0, 240.0])
+def test_disc_is_found(
+    size: tuple[int, int], centre: tuple[float, float], radius: float, level: float
+) -> None:
+    field = find_field_of_view(disc(size, centre, radius, level))
+    assert field is not None
+    pixel = min(size) / 180  # of the size at which it is looked for
+    np.testing.assert_allclose(field.centre, centre, atol=pixel)
+    assert field.radius == pytest.approx(radius, abs=pixel)
+
+
+def test_letterbox_bars_are_not_the_disc() -> None:
+    image = disc((1280, 720), (640, 360), 480)
+    image[:90] = image[-90:] = 16
+    field = find_field_of_view(image)
+    assert field is not None
+    assert field.radius == pytest.approx(480, abs=6)
+    assert field.box[1] == pytest.approx(90, abs=5)
+    assert field.box[3] == pytest.approx(629, abs=5)
+    assert field.depth_inside([640, 60]) < 0 < field.depth_inside([640, 120])
+
+
+def test_a_picture_that_fills_the_frame_has_no_disc() -> None:
+    rng = np.random.default_rng(1)
+    image = np.clip(rng.normal(120, 20, (720, 1280, 3)), 0, 255).astype(np.uint8)
+    field = find_field_of_view(image)
+    assert field is not None
+    assert np.isinf(field.radius)
+    assert field.depth_inside([5.0, 360.0]) == pytest.approx(5.0, abs=1.0)
+
+
+def test_nothing_is_found_in_the_dark() -> None:
+    assert find_field_of_view(np.zeros((720, 1280, 3), np.uint8)) is None
+    noise = np.random.default_rng(2).integers(0, 8, (720, 1280, 3)).astype(np.uint8)
+    assert find_field_of_view(noise) is None
+
+
+def test_mask_agrees_with_depth() -> None:
+    field = find_field_of_view(disc((1280, 720), (640, 360), 350))
+    assert field is not None
+    full, quarter = field.mask((720, 1280)), field.mask((180, 320), 0.25)
+    assert full.sum() == pytest.approx(np.pi * field.radius**2, rel=0.002)
+    assert 16 * quarter.sum() == pytest.approx(full.sum(), rel=0.01)
+
+
+def test_stream_keeps_the_disc_through_dark_images_and_finds_a_new_one_for_a_new_size() -> None:
+    finder = FieldOfViewFinder()
+    assert finder.find(np.zeros((720, 1280, 3), np.uint8)) is None
+    found = finder.find(disc((1280, 720), (640, 360), 350))
+    assert found is not None
+    assert finder.find(np.zeros((720, 1280, 3), np.uint8)) == found
+    smaller = finder.find(disc((640, 480), (320, 240), 200))
+    assert smaller is not None
+    assert smaller.radius == pytest.approx(200, abs=3)
+
+
+def test_a_disc_that_grows_is_found_anew() -> None:
+    finder = FieldOfViewFinder()
+    finder.find(disc((1280, 720), (640, 360), 220))
+    for _ in range(finder.MISFITS + 1):
+        field = finder.find(disc((1280, 720), (640, 360), 350))
+    assert field is not None
+    assert field.radius == pytest.approx(350, abs=4)
+
+
+def test_real_rigid_endoscope(real_images: Callable[[str], list[Path]]) -> None:
+    fields = []
+    for file in real_images("sinus_endoscope/000*.jpg"):
+        field = find_field_of_view(cv2.imread(str(file)))
+        assert field is not None
+        fields.append([*field.centre, field.radius])
+    # The scope's own disc does not move in the picture: (994, 544), 527 px by eye.
+    np.testing.assert_allclose(fields, np.tile([994.0, 544.5, 527.0], (len(fields), 1)), atol=3.0)
+
+
+def test_real_laparoscope(real_images: Callable[[str], list[Path]]) -> None:
+    video = cv2.VideoCapture(str(real_images("laparoscope_video/endo.mp4")[0]))
+    for _ in range(5):
+        read, image = video.read()
+        assert read
+    field = find_field_of_view(image)
+    assert field is not None
+    assert field.radius == pytest.approx(568, abs=5)
+    dark = find_field_of_view((image * 0.25).astype(np.uint8))
+    assert dark is not None
+    assert dark.radius == pytest.approx(568, abs=12)

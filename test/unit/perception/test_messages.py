@@ -1,0 +1,151 @@
+"""Images out of messages, edges into them."""
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.messages import fill_gap_edges, image_from_compressed, image_from_message, stamp_ns
+
+Image = npt.NDArray[np.uint8]
+
+
+@pytest.fixture
+def picture() -> Image:
+    return np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)
+
+
+def message(image: npt.NDArray[np.generic], encoding: str, padding: int = 0) -> SimpleNamespace:
+    rows = image.reshape(image.shape[0], -1).view(np.uint8)
+    padded = np.pad(rows, ((0, 0), (0, padding)))
+    return SimpleNamespace(
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding=encoding,
+        step=padded.shape[1],
+        data=padded.tobytes(),
+    )
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+def test_colour_orders_give_the_same_image(picture: Image, padding: int) -> None:
+    alpha = np.full((12, 16, 1), 255, np.uint8)
+    for encoding, data in (
+        ("bgr8", picture),
+        ("8UC3", picture),
+        ("rgb8", picture[..., ::-1]),
+        ("bgra8", np.concatenate([picture, alpha], axis=2)),
+        ("rgba8", np.concatenate([picture[..., ::-1], alpha], axis=2)),
+    ):
+        given = message(np.ascontiguousarray(data), encoding, padding)
+        np.testing.assert_array_equal(image_from_message(given), picture)
+
+
+def test_mono_becomes_grey(picture: Image) -> None:
+    grey = np.ascontiguousarray(picture[..., 0])
+    image = image_from_message(message(grey, "mono8"))
+    assert image.shape == (12, 16, 3)
+    for channel in range(3):
+        np.testing.assert_array_equal(image[..., channel], grey)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"encoding": "bayer_rggb8"}, "Bayer.*debayered"),
+        ({"encoding": "mono16"}, "8 bits"),
+        ({"encoding": "16UC3"}, "8 bits"),
+        ({"encoding": "32FC1"}, "8 bits"),
+        ({"encoding": ""}, "one of bgr8"),
+        ({"encoding": "yuv422_yuy2"}, "one of bgr8"),
+        ({"height": 0}, "1x1"),
+        ({"width": 0}, "1x1"),
+        ({"step": 10}, "step"),
+        ({"data": b""}, "bytes"),
+        ({"data": b"abc"}, "bytes"),
+    ],
+)
+def test_images_that_cannot_be_used_are_refused(
+    picture: Image, changes: dict[str, object], reason: str
+) -> None:
+    given = SimpleNamespace(**{**vars(message(picture, "bgr8")), **changes})
+    with pytest.raises(PerceptionError, match=reason):
+        image_from_message(given)
+
+
+def compressed(data: bytes, description: str = "jpeg") -> SimpleNamespace:
+    return SimpleNamespace(format=description, data=data)
+
+
+def encoded(image: npt.NDArray[np.generic], extension: str) -> bytes:
+    return bytes(cv2.imencode(extension, image)[1])
+
+
+def test_compressed_images(picture: Image) -> None:
+    np.testing.assert_array_equal(image_from_compressed(compressed(encoded(picture, ".png"), "png")), picture)
+    smooth = np.full((32, 32, 3), (40, 90, 200), np.uint8)
+    decoded = image_from_compressed(compressed(encoded(smooth, ".jpg"), "bgr8; jpeg compressed bgr8"))
+    np.testing.assert_allclose(decoded.astype(int), smooth, atol=4)
+    grey = image_from_compressed(compressed(encoded(smooth[..., 1], ".jpg")))
+    assert grey.shape == (32, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("data", "description", "reason"),
+    [
+        (b"", "jpeg", "empty"),
+        (b"no picture at all", "jpeg", "decoded"),
+        (b"\xff\xd8\xff\xe0 cut", "jpeg", "decoded"),
+        (encoded(np.zeros((8, 8), np.uint16), ".png"), "png", "8 bits"),
+        (encoded(np.zeros((8, 8), np.uint8), ".png"), "bayer_rggb8; png compressed", "Bayer"),
+        (encoded(np.zeros((8, 8), np.uint8), ".png"), "16UC1; compressedDepth", "depth"),
+    ],
+)
+def test_compressed_images_that_cannot_be_used_are_refused(
+    data: bytes, description: str, reason: str
+) -> None:
+    with pytest.raises(PerceptionError, match=reason):
+        image_from_compressed(compressed(data, description))
+
+
+def blank_edges() -> SimpleNamespace:
+    stamp = SimpleNamespace(sec=0, nanosec=0)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=""),
+        bearing_0=SimpleNamespace(x=0.0, y=0.0, z=0.0),
+        bearing_1=SimpleNamespace(x=0.0, y=0.0, z=0.0),
+    )
+
+
+def test_edges_fill_every_field_of_the_message() -> None:
+    covariances = np.arange(18, dtype=float).reshape(2, 3, 3)
+    edges = GapEdges(
+        stamp_ns=1_700_000_000_123_456_789,
+        frame_id="lens",
+        status=EdgeStatus.VALID,
+        track_id=7,
+        bearings=np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]]),
+        pixels=np.array([[1.0, 2.0], [3.0, 4.0]]),
+        kinds=(EdgeKind.RIM, EdgeKind.CONTOUR),
+        covariances=covariances,
+        angular_error=0.01,
+    )
+    filled = fill_gap_edges(blank_edges(), edges)
+    assert stamp_ns(filled.header) == edges.stamp_ns
+    assert filled.header.frame_id == "lens"
+    assert (filled.status, filled.track_id) == (1, 7)
+    assert (filled.bearing_1.x, filled.bearing_1.z) == (0.6, 0.8)
+    np.testing.assert_array_equal(filled.pixel_1, [3.0, 4.0])
+    assert (filled.kind_0, filled.kind_1) == (1, 2)
+    np.testing.assert_array_equal(filled.covariance_1, np.arange(9.0, 18.0))
+    assert filled.angular_error == 0.01
+
+
+def test_unknown_points_are_nan_in_the_message() -> None:
+    filled = fill_gap_edges(blank_edges(), GapEdges.without_points(5, "lens", EdgeStatus.NO_GAP))
+    assert (filled.status, filled.track_id, filled.kind_0) == (2, 0, 0)
+    assert np.isnan([filled.bearing_0.x, *filled.pixel_0, *filled.covariance_1, filled.angular_error]).all()
