@@ -142,7 +142,10 @@ class PoseValidity:
         found = self._stamp_fault(body) or self._form_fault(body) or self._motion_fault(body, tuple(others))
         if found is None:
             return None
-        reason, detail = found
+        return self.refuse(body, *found)
+
+    def refuse(self, body: BodyPose, reason: RefusalReason, detail: str) -> Refusal:
+        """Count a refusal for whatever reason, and return it."""
         self.counts[reason] += 1
         return Refusal(body.stamp_ns, reason, detail)
 

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
-from knee_gap_perception.pose_validity import PoseValidity, Refusal, ValidityParameters
+from knee_gap_perception.pose_validity import PoseValidity, Refusal, RefusalReason, ValidityParameters
 from knee_gap_perception.poses import Array, BodyPose, LensPose, cross_matrix, rigid_transform
+from knee_gap_perception.reference_body import relative_to
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,14 @@ class TrackingParameters:
         },
     )
 
+    reference_body: str = field(
+        default="",
+        metadata={
+            "description": "Tracked body of the leg in whose frame the lens pose is given, with that "
+            "name as frame; empty gives it in frame_id"
+        },
+    )
+
     def __post_init__(self) -> None:
         for name, length in (("body_to_shaft_translation", 3), ("body_to_shaft_quaternion_xyzw", 4)):
             # ROS hands lists as arrays.
@@ -105,6 +114,7 @@ class ScopeTracker:
     ) -> None:
         self.parameters = parameters or TrackingParameters()
         self.validity = PoseValidity(validity)
+        self.reference_validity = PoseValidity(validity)
         self.accepted_count = 0
         self._T_body_lens = self.parameters.body_to_lens()
 
@@ -112,16 +122,38 @@ class ScopeTracker:
         """Return the pose of the lens at the stamp of `body`, or why there is none.
 
         `others` are the other bodies of the same frame of the tracker, if it tells them: a body that has
-        swapped its label with one of them is refused.
+        swapped its label with one of them is refused. The reference body, if there is to be one, must be
+        among them and as sound as the scope.
         """
-        if refusal := self.validity.check(body, others):
+        bodies = tuple(others)
+        name = self.parameters.reference_body
+        reference = next((other for other in bodies if name and other.name == name), None)
+        # Both are looked at in every frame, whatever the other one's fault: their history must have no holes.
+        refusal = self.validity.check(body, bodies)
+        if name and (fault := self._reference_fault(body, reference, bodies)) and refusal is None:
+            refusal = self.validity.refuse(body, RefusalReason.NO_REFERENCE, fault)
+        if refusal is not None:
             return refusal
         self.accepted_count += 1
-        return self._lens_pose(body)
+        lens = self._lens_pose(body)
+        return lens if reference is None else relative_to(lens, reference, self._body_covariance())
 
     def reset(self) -> None:
         """Start afresh, as after a change of the set-up; the counts go on."""
         self.validity.reset()
+        self.reference_validity.reset()
+
+    def _reference_fault(
+        self, body: BodyPose, reference: BodyPose | None, bodies: tuple[BodyPose, ...]
+    ) -> str | None:
+        name = self.parameters.reference_body
+        if reference is None:
+            return f"the reference body '{name}' is not in the frame"
+        if reference.stamp_ns != body.stamp_ns:
+            return f"the reference body '{name}' has another stamp than the scope"
+        rest = tuple(other for other in bodies if other is not reference)
+        refusal = self.reference_validity.check(reference, (body, *rest))
+        return None if refusal is None else f"reference body '{name}': {refusal.detail}"
 
     def _lens_pose(self, body: BodyPose) -> LensPose:
         parameters = self.parameters
@@ -139,10 +171,13 @@ class ScopeTracker:
 
     def _covariance(self, lever: Array) -> Array:
         """Covariance (6, 6) of the lens pose; a small rotation r moves the lens by r x lever."""
-        parameters = self.parameters
-        variances = np.repeat([parameters.translation_error**2 / 3.0, parameters.rotation_error**2 / 3.0], 3)
-        if parameters.translation_error_at == "lens":
-            return np.diag(variances)
+        covariance = self._body_covariance()
+        if self.parameters.translation_error_at == "lens":
+            return covariance
         J = np.eye(6)
         J[:3, 3:] = -cross_matrix(lever)
-        return np.asarray(J @ np.diag(variances) @ J.T)
+        return np.asarray(J @ covariance @ J.T)
+
+    def _body_covariance(self) -> Array:
+        translation, rotation = self.parameters.translation_error, self.parameters.rotation_error
+        return np.diag(np.repeat([translation**2 / 3.0, rotation**2 / 3.0], 3))
