@@ -1,0 +1,140 @@
+"""Turns a take that Motive exported as CSV into a bag of poses, beside a video or another bag in time.
+
+Frames in which the body was not seen are left out: a gap in the bag is what tracking_node takes for one. Time
+zero of the take is its capture start (by the clock of Motive's machine, taken as UTC), or --start, or the
+first message of the bag given with --align; --offset is added.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.optitrack.motive_csv import Take, TakeBody, read_take
+from knee_gap_perception.optitrack.up_axis import UP_AXES
+from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_replay.command_line import Parser, not_negative, run
+from knee_gap_replay.errors import BagError
+from knee_gap_replay.topics import namespace_from
+from knee_gap_replay.types import blank
+
+NANOSECONDS = 1_000_000_000
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+def write_take(
+    take: Take, bodies: Sequence[tuple[str, TakeBody]], writer: BagWriter, start_ns: int
+) -> list[int]:
+    """Write bodies to their topics, in the order of the frames; return how many poses each has."""
+    for topic, _ in bodies:
+        writer.add_topic(topic, POSE, "sensor")
+    seen = [body.seen for _, body in bodies]
+    counts = [0] * len(bodies)
+    for index, time in enumerate(take.time):
+        stamp_ns = start_ns + round(float(time) * NANOSECONDS)
+        for number, (topic, body) in enumerate(bodies):
+            if seen[number][index]:
+                writer.write(topic, _pose(body, index, stamp_ns), stamp_ns)
+                counts[number] += 1
+    return counts
+
+
+def _pose(body: TakeBody, index: int, stamp_ns: int) -> Any:
+    message = blank(POSE)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    message.header.frame_id = "world"
+    place, turn = message.pose.position, message.pose.orientation
+    place.x, place.y, place.z = (float(value) for value in body.position[index])
+    turn.x, turn.y, turn.z, turn.w = (float(value) for value in body.quaternion_xyzw[index])
+    return message
+
+
+def _start_ns(take: Take, arguments: argparse.Namespace) -> int:
+    start: int
+    if arguments.align is not None:
+        start = _first_stamp_ns(arguments.align, arguments.align_topic)
+    elif arguments.start is not None:
+        start = round(arguments.start * NANOSECONDS)
+    elif take.start is not None:
+        start = round(take.start.timestamp() * 1000) * 1_000_000
+    else:
+        raise BagError(
+            f"the take's start '{take.start_text}' cannot be read; say when it was with --start or --align"
+        )
+    start += round(arguments.offset * NANOSECONDS)
+    if start < 0:
+        before = f"{-start / NANOSECONDS:.3f} s before 1970"
+        raise BagError(f"the take would start {before}; check --start and --offset")
+    return start
+
+
+def _first_stamp_ns(bag: str, topic: str | None) -> int:
+    """Stamp of a bag's first message, or when it was recorded where it has none."""
+    with BagReader(bag) as reader:
+        first = next(iter(reader.messages(None if topic is None else [topic])), None)
+        if first is None:
+            raise BagError(f"{bag} has no message to align to")
+        header = getattr(reader.deserialize(first), "header", None)
+    if header is None:
+        return int(first.time_ns)
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    try:
+        take = read_take(Path(arguments.take), up_axis=arguments.up_axis, partial=arguments.partial)
+        space = namespace_from(arguments)
+        bodies = [(arguments.topic or f"{space}/scope_body/pose", take.body(arguments.body))]
+        if arguments.reference is not None:
+            bodies.append((f"{space}/reference_body/pose", take.body(arguments.reference)))
+    except PerceptionError as error:
+        raise BagError(str(error)) from None
+    if not any(body.seen.any() for _, body in bodies[:1]):
+        raise BagError(f"{arguments.take}: the body '{arguments.body}' is not seen in any frame")
+    start_ns = _start_ns(take, arguments)
+    metadata = {"take": Path(arguments.take).name, "take_format": take.version, "take_start": take.start_text}
+    with BagWriter(arguments.out, metadata=metadata) as writer:
+        counts = write_take(take, bodies, writer, start_ns)
+    frames = len(take.time)
+    if take.exported_count not in (None, frames):
+        print(
+            f"import_motive: the file says {take.exported_count} frames and holds {frames}", file=sys.stderr
+        )
+    told = ", ".join(
+        f"{count} of '{body.name}' on {topic}" for count, (topic, body) in zip(counts, bodies, strict=True)
+    )
+    print(f"import_motive: {frames} frames, poses: {told}, in {arguments.out}")
+    return 0
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="import_motive", description=__doc__)
+    parser.add_argument("take", metavar="TAKE.csv", help="export of Motive, format 1.20 to 1.25")
+    parser.add_argument("body", metavar="BODY", help="name or id of the scope's rigid body")
+    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument(
+        "--reference", metavar="BODY", help="rigid body of the leg, to NAMESPACE/reference_body/pose"
+    )
+    parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="of the topics (/knee_gap)")
+    parser.add_argument("--topic", help="of the scope's poses (NAMESPACE/scope_body/pose)")
+    parser.add_argument("--up-axis", choices=UP_AXES, default="y", help="axis that points up in the take (y)")
+    parser.add_argument("--offset", type=float, default=0.0, metavar="S", help="to add to all stamps [s] (0)")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument(
+        "--start", type=not_negative, metavar="S", help="time of the take's start since 1970 [s]"
+    )
+    start.add_argument("--align", metavar="BAG", help="bag whose first message is the take's start")
+    parser.add_argument("--align-topic", metavar="TOPIC", help="of that bag, where its first message counts")
+    parser.add_argument("--partial", action="store_true", help="read what there is of a file that was cut")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Import a take."""
+    return run(_parser(), _run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

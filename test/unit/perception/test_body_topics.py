@@ -1,0 +1,150 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from knee_gap_perception.optitrack.body_source import UnknownBodyError, choose_body
+from knee_gap_perception.optitrack.pose_topic import PoseTopics
+from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
+
+MILLISECOND = 1_000_000
+
+
+def header(stamp_ns):
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id="map")
+
+
+def pose(position, turn=(0.0, 0.0, 0.0)):
+    x, y, z, w = Rotation.from_rotvec(turn).as_quat()
+    return SimpleNamespace(
+        position=SimpleNamespace(x=position[0], y=position[1], z=position[2]),
+        orientation=SimpleNamespace(x=x, y=y, z=z, w=w),
+    )
+
+
+def stamped(stamp_ns, position=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
+    return SimpleNamespace(header=header(stamp_ns), pose=pose(position, turn))
+
+
+class TestPoseTopics:
+    def test_one_topic_comes_through_as_it_is(self):
+        source = PoseTopics(["scope"])
+        for index in range(3):
+            source.put("scope", stamped(index * MILLISECOND, (0.1, 0.2, 0.3)))
+        frames = source.poll()
+        assert [frame.stamp_ns for frame in frames] == [0, MILLISECOND, 2 * MILLISECOND]
+        np.testing.assert_array_equal(frames[0].bodies[0].position, [0.1, 0.2, 0.3])
+        assert choose_body(frames[0], "")[0].name == "scope"
+        assert source.poll() == []
+
+    def test_y_up_is_turned(self):
+        source = PoseTopics(["scope"], up_axis="y")
+        source.put("scope", stamped(0, (0.1, 0.2, 0.3), (0.0, 0.4, 0.0)))
+        (frame,) = source.poll()
+        np.testing.assert_allclose(frame.bodies[0].position, [0.1, -0.3, 0.2])
+        rotvec = Rotation.from_quat(frame.bodies[0].quaternion_xyzw).as_rotvec()
+        np.testing.assert_allclose(rotvec, [0.0, 0.0, 0.4])
+
+    @pytest.mark.parametrize("first", ["scope", "tibia"])
+    def test_poses_of_one_stamp_belong_together_whichever_comes_first(self, first):
+        source = PoseTopics(["scope", "tibia"])
+        second = "tibia" if first == "scope" else "scope"
+        source.put(first, stamped(MILLISECOND))
+        source.put(second, stamped(MILLISECOND))
+        (frame,) = source.poll()
+        assert [body.name for body in frame.bodies] == ["scope", "tibia"]
+
+    def test_the_leg_is_interpolated_to_the_scope_and_never_beyond(self):
+        source = PoseTopics(["scope", "tibia"])
+        source.put("tibia", stamped(0, (0.0, 0.0, 0.0)))
+        source.put("scope", stamped(4 * MILLISECOND))
+        assert source.poll() == []
+        source.put("tibia", stamped(8 * MILLISECOND, (0.008, 0.0, 0.0), (0.0, 0.0, 0.2)))
+        (frame,) = source.poll()
+        leg = frame.bodies[1]
+        assert leg.stamp_ns == frame.stamp_ns
+        np.testing.assert_allclose(leg.position, [0.004, 0.0, 0.0])
+        np.testing.assert_allclose(Rotation.from_quat(leg.quaternion_xyzw).as_rotvec(), [0.0, 0.0, 0.1])
+
+    def test_the_scope_does_not_wait_for_ever_for_a_leg_that_is_gone(self):
+        source = PoseTopics(["scope", "tibia"], max_wait=0.05)
+        frames = []
+        for index in range(20):
+            source.put("scope", stamped(index * 10 * MILLISECOND))
+            frames += source.poll()
+        assert len(frames) == 14
+        assert all(len(frame.bodies) == 1 for frame in frames)
+
+    def test_a_malformed_leg_is_not_interpolated(self):
+        source = PoseTopics(["scope", "tibia"])
+        source.put("tibia", stamped(0, (float("nan"), 0.0, 0.0)))
+        source.put("tibia", stamped(8 * MILLISECOND))
+        source.put("scope", stamped(4 * MILLISECOND))
+        source.put("scope", stamped(80 * MILLISECOND))
+        frame, *_ = source.poll()
+        assert [body.name for body in frame.bodies] == ["scope"]
+
+    def test_a_bag_that_starts_again_is_not_joined_to_its_end(self):
+        source = PoseTopics(["scope", "tibia"])
+        for stamp in (100, 110, 120):
+            source.put("tibia", stamped(stamp * MILLISECOND))
+            source.put("scope", stamped(stamp * MILLISECOND))
+        source.poll()
+        source.put("tibia", stamped(1 * MILLISECOND))
+        source.put("scope", stamped(2 * MILLISECOND))
+        assert source.poll() == []
+        source.put("tibia", stamped(3 * MILLISECOND, (0.5, 0.0, 0.0)))
+        (frame,) = source.poll()
+        np.testing.assert_allclose(frame.bodies[1].position, [0.25, 0.0, 0.0])
+
+    def test_silent_topics_are_named(self):
+        source = PoseTopics(["scope", "tibia"])
+        source.put("scope", stamped(0))
+        status = source.status()
+        assert not status.ok
+        assert "no poses of tibia" in status.words
+        assert "scope, tibia" in source.status().words
+
+
+class TestRigidBodies:
+    def message(self, stamp_ns, *bodies):
+        return SimpleNamespace(
+            header=header(stamp_ns),
+            frame_number=7,
+            rigidbodies=[
+                SimpleNamespace(rigid_body_name=name, markers=[], pose=pose(position))
+                for name, position in bodies
+            ],
+        )
+
+    def test_bodies_are_chosen_by_name_or_by_number(self):
+        source = RigidBodiesTopic()
+        source.put(self.message(5, ("12", (0.0, 0.0, 1.0)), ("scope", (0.0, 0.0, 2.0))))
+        (frame,) = source.poll()
+        assert choose_body(frame, "scope")[0].position[2] == 2.0
+        assert choose_body(frame, "12")[0].position[2] == 1.0
+        with pytest.raises(UnknownBodyError, match=r"it has: '12' \(id 12\), 'scope' \(id 13\)"):
+            choose_body(frame, "femur")
+        assert source.status().ok
+        assert not source.status().ok
+
+    def test_a_body_that_was_seen_before_is_known_while_it_is_hidden(self):
+        source = RigidBodiesTopic()
+        source.put(self.message(5, ("scope", (0.0, 0.0, 1.0)), ("tibia", (0.0, 0.0, 2.0))))
+        source.put(self.message(6, ("tibia", (0.0, 0.0, 2.0))))
+        body, others = choose_body(source.poll()[1], "scope")
+        assert body is None
+        assert [other.name for other in others] == ["tibia"]
+
+    def test_y_up_is_turned(self):
+        source = RigidBodiesTopic(up_axis="y")
+        source.put(self.message(5, ("scope", (0.1, 0.2, 0.3))))
+        np.testing.assert_allclose(source.poll()[0].bodies[0].position, [0.1, -0.3, 0.2])
+
+    def test_memory_is_bounded_when_nobody_asks(self):
+        source = RigidBodiesTopic()
+        for index in range(1000):
+            source.put(self.message(index, ("scope", (0.0, 0.0, 1.0))))
+        assert len(source.poll()) == 64

@@ -1,0 +1,290 @@
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from knee_gap_perception.optitrack.body_source import UnknownBodyError
+from knee_gap_perception.optitrack.motive_csv import TakeError, _start_time, read_take
+
+TAKES = Path(__file__).resolve().parents[4] / "shared" / "data" / "optitrack" / "motive_csv"
+
+
+def real_take(name):
+    path = TAKES / name
+    if not path.is_file():
+        pytest.skip(f"the recorded takes are not at {TAKES}")
+    return path
+
+
+class Export:
+    """Writes takes as Motive does, so that every variety can be had."""
+
+    def __init__(
+        self,
+        *,
+        version="1.23",
+        rotation="Quaternion",
+        unit="Meters",
+        parent=False,
+        timecode=False,
+        labels=True,
+        delimiter=",",
+        decimal=".",
+        newline="\r\n",
+        bodies=("scope", "tibia"),
+        start="2021-04-18 02.24.27.730 PM",
+    ):
+        self.keys = {
+            "Format Version": version,
+            "Take Name": "a take",
+            "Capture Frame Rate": "100.000000",
+            "Export Frame Rate": "100.000000",
+            "Capture Start Time": start,
+            "Total Frames in Take": "3",
+            "Total Exported Frames": "3",
+            "Rotation Type": rotation,
+            "Length Units": unit,
+            "Coordinate Space": "Global",
+        }
+        self.parent, self.timecode, self.labels = parent, timecode, labels
+        self.delimiter, self.decimal, self.newline = delimiter, decimal, newline
+        self.bodies = bodies
+        self.axes = ["X", "Y", "Z", "W"] if rotation == "Quaternion" else ["X", "Y", "Z"]
+
+    def text(self, rows, first_frame=0):
+        """`rows` hold per frame and body a rotation, a position and an error, or None where not seen."""
+        width = len(self.axes) + 4
+        before = ["", ""] + [""] * self.timecode
+
+        def heading(label, cells):
+            return ["", label if self.labels else "", *before[2:], *cells]
+
+        def per_body(values):
+            return [value for value in values for _ in range(width)]
+
+        lines = [[cell for item in self.keys.items() for cell in item], []]
+        lines.append(heading("Type", per_body(["Rigid Body"] * len(self.bodies)) + ["Marker"] * 3))
+        lines.append(heading("Name", per_body(self.bodies) + ["Unlabeled 7"] * 3))
+        lines.append(heading("ID", per_body([f"ID{name}" for name in self.bodies]) + ["C1"] * 3))
+        if self.parent:
+            lines.append(heading("Parent", [""] * (width * len(self.bodies) + 3)))
+        kinds = ["Rotation"] * len(self.axes) + ["Position"] * 3 + ["Mean Marker Error"]
+        lines.append([*before, *kinds * len(self.bodies), *["Position"] * 3])
+        axes = [*self.axes, "X", "Y", "Z", ""] * len(self.bodies)
+        lines.append(["Frame", "Time (Seconds)", *["TimeCode"] * self.timecode, *axes, "X", "Y", "Z"])
+        for index, row in enumerate(rows, start=first_frame):
+            cells = [str(index), self.number(index / 100), *["15:26:46:12.02"] * self.timecode]
+            for body in row:
+                cells += [""] * width if body is None else [self.number(value) for value in body]
+            lines.append([*cells, "", "", ""])
+        return self.newline.join(self.delimiter.join(line) for line in lines) + self.newline
+
+    def number(self, value):
+        return "" if value is None else f"{value:.6f}".replace(".", self.decimal)
+
+
+def written(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "take.csv"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+TURN = Rotation.from_euler("XYZ", [20.0, -35.0, 110.0], degrees=True)
+SEEN = (*TURN.as_quat(), 0.1, 0.2, 0.3, 0.0004)
+EULER = (20.0, -35.0, 110.0, 0.1, 0.2, 0.3, 0.0004)
+ROWS = [[SEEN, SEEN], [SEEN, None], [SEEN, SEEN]]
+
+
+class TestVarieties:
+    @pytest.mark.parametrize(
+        "export",
+        [
+            Export(version="1.21", labels=False),
+            Export(version="1.22"),
+            Export(version="1.23"),
+            Export(version="1.24", timecode=True),
+            Export(version="1.25", parent=True, timecode=True),
+            Export(version="1.25", parent=True),
+            Export(delimiter=";", decimal=","),
+            Export(delimiter="\t"),
+            Export(newline="\n"),
+        ],
+        ids=str,
+    )
+    @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+    def test_every_form_of_the_file_gives_the_same(self, tmp_path, export, encoding):
+        take = read_take(written(tmp_path, export.text(ROWS, first_frame=7), encoding), up_axis="z")
+        assert take.version == export.keys["Format Version"]
+        assert [body.name for body in take.bodies] == ["scope", "tibia"]
+        np.testing.assert_allclose(take.time, [0.07, 0.08, 0.09])
+        np.testing.assert_array_equal(take.frame, [7, 8, 9])
+        scope = take.body("scope")
+        np.testing.assert_allclose(scope.position, [[0.1, 0.2, 0.3]] * 3)
+        np.testing.assert_allclose(scope.mean_error, [0.0004] * 3)
+        error = Rotation.from_quat(scope.quaternion_xyzw) * TURN.inv()
+        assert error.magnitude().max() < 2e-6
+        assert take.body("IDtibia").seen.tolist() == [True, False, True]
+
+    @pytest.mark.parametrize(
+        ("unit", "scale"), [("Meters", 1.0), ("Centimeters", 0.01), ("Millimeters", 0.001)]
+    )
+    def test_lengths_come_in_metres(self, tmp_path, unit, scale):
+        take = read_take(written(tmp_path, Export(unit=unit).text(ROWS)), up_axis="z")
+        np.testing.assert_allclose(take.bodies[0].position[0], np.array([0.1, 0.2, 0.3]) * scale)
+        np.testing.assert_allclose(take.bodies[0].mean_error[0], 0.0004 * scale)
+
+    def test_euler_angles_are_about_the_axes_of_the_body(self, tmp_path):
+        take = read_take(written(tmp_path, Export(rotation="XYZ").text([[EULER, None]])), up_axis="z")
+        by_hand = (
+            Rotation.from_rotvec([np.radians(20.0), 0, 0])
+            * Rotation.from_rotvec([0, np.radians(-35.0), 0])
+            * Rotation.from_rotvec([0, 0, np.radians(110.0)])
+        )
+        read = Rotation.from_quat(take.bodies[0].quaternion_xyzw[0])
+        assert (read * by_hand.inv()).magnitude() < 1e-6
+
+    def test_the_order_of_turning_is_not_the_order_of_the_columns(self, tmp_path):
+        take = read_take(written(tmp_path, Export(rotation="ZYX").text([[EULER, None]])), up_axis="z")
+        by_hand = (
+            Rotation.from_rotvec([0, 0, np.radians(110.0)])
+            * Rotation.from_rotvec([0, np.radians(-35.0), 0])
+            * Rotation.from_rotvec([np.radians(20.0), 0, 0])
+        )
+        read = Rotation.from_quat(take.bodies[0].quaternion_xyzw[0])
+        assert (read * by_hand.inv()).magnitude() < 1e-6
+
+    @pytest.mark.parametrize(
+        ("text", "hour"),
+        [
+            ("2018-10-05 12.05.03.445 P.M.", 12),
+            ("2018-10-05 12.05.03.445 AM", 0),
+            ("2018-10-05 01.05.03.445 p. m.", 13),
+            ("2018-10-05 下午 01.05.03.445", 13),
+            ("2018-10-05 오전 09.05.03.445", 9),
+            ("2018-10-05 21.05.03.445", 21),
+            ("2018/10/05 21:05:03", 21),
+        ],
+    )
+    def test_start_times_of_several_languages(self, text, hour):
+        start = _start_time(text)
+        assert start.replace(microsecond=0) == datetime(2018, 10, 5, hour, 5, 3, tzinfo=UTC)
+
+    @pytest.mark.parametrize("text", ["", "yesterday", "2018-13-05 01.05.03 PM", "2018-10-05 01.05.03 qqq"])
+    def test_start_times_that_nobody_can_read_are_none(self, text):
+        assert _start_time(text) is None
+
+
+class TestMissing:
+    def test_empty_cells_are_no_numbers(self, tmp_path):
+        body = read_take(written(tmp_path, Export().text(ROWS))).body("tibia")
+        assert np.isnan(body.position[1]).all()
+        assert np.isnan(body.quaternion_xyzw[1]).all()
+        assert np.isnan(body.mean_error[1])
+
+    @pytest.mark.parametrize("missing", range(7))
+    def test_one_empty_cell_is_enough(self, tmp_path, missing):
+        partly = [None if index == missing else value for index, value in enumerate(SEEN)]
+        body = read_take(written(tmp_path, Export().text([[partly, SEEN]]))).body("scope")
+        assert not body.seen.any()
+
+    def test_what_is_no_rotation_is_not_seen(self, tmp_path):
+        zero = (0.0, 0.0, 0.0, 0.0, *SEEN[4:])
+        body = read_take(written(tmp_path, Export().text([[zero, SEEN]]))).body("scope")
+        assert not body.seen.any()
+
+    def test_frames_say_which_body_was_not_seen(self, tmp_path):
+        frames = list(read_take(written(tmp_path, Export().text(ROWS))).frames(5_000_000_000))
+        assert [frame.stamp_ns for frame in frames] == [5_000_000_000, 5_010_000_000, 5_020_000_000]
+        assert [pose.tracking_valid for pose in frames[1].bodies] == [True, False]
+
+
+class TestRefusals:
+    def check(self, tmp_path, text, message, **options):
+        with pytest.raises(TakeError, match=message) as raised:
+            read_take(written(tmp_path, text), **options)
+        assert "\n" not in str(raised.value)
+
+    def test_a_body_that_is_not_there(self, tmp_path):
+        take = read_take(written(tmp_path, Export().text(ROWS)))
+        with pytest.raises(UnknownBodyError, match="no rigid body 'femur'; it has: 'scope', 'tibia'"):
+            take.body("femur")
+
+    def test_no_take_at_all(self, tmp_path):
+        self.check(tmp_path, "a,b\n1,2\n", "must start with 'Format Version'")
+        self.check(tmp_path, "", "must start with 'Format Version'")
+        with pytest.raises(TakeError, match="No such file"):
+            read_take(tmp_path / "none.csv")
+
+    def test_a_file_cut_anywhere_is_never_read_as_a_whole_one(self, tmp_path):
+        text = Export(newline="\n").text(ROWS)
+        whole = read_take(written(tmp_path, text))
+        for length in range(0, len(text) - 1, 3):
+            try:
+                cut = read_take(written(tmp_path, text[:length]))
+            except TakeError:
+                continue
+            # At the end of a line only the header's count tells a shorter take from a whole one.
+            assert text[:length].endswith("\n")
+            assert len(cut.time) < cut.exported_count == len(whole.time)
+
+    def test_what_is_whole_of_a_cut_file_on_request(self, tmp_path):
+        text = Export().text(ROWS)[:-20]
+        self.check(tmp_path, text, "line 10: the file ends in the middle of it, after 2 whole frames")
+        take = read_take(written(tmp_path, text), partial=True)
+        assert len(take.time) == 2
+
+    def test_decimal_commas_between_commas(self, tmp_path):
+        text = Export(decimal=",").text(ROWS)
+        self.check(tmp_path, text, "decimal comma in a file that is separated by commas")
+
+    def test_units_and_rotations_that_are_not_known(self, tmp_path):
+        self.check(tmp_path, Export(unit="Furlongs").text(ROWS), "must be Meters, .* not 'Furlongs'")
+        text = Export().text(ROWS)
+        self.check(tmp_path, text.replace("Quaternion", "Axis"), "rotation type must be one of .* not 'Axis'")
+        self.check(
+            tmp_path, text.replace("Quaternion", "XYZ"), "4 numbers of rotation, which is not the stated type"
+        )
+        self.check(tmp_path, text.replace("Global", "Local"), "coordinate space must be Global")
+
+    def test_times_that_do_not_rise(self, tmp_path):
+        text = Export().text(ROWS).replace("\r\n2,0.020000", "\r\n2,0.010000")
+        self.check(tmp_path, text, "line 10: its time does not follow")
+
+    def test_two_bodies_of_one_name(self, tmp_path):
+        self.check(tmp_path, Export(bodies=("scope", "scope")).text(ROWS), "two columns are called")
+
+    def test_without_header(self, tmp_path):
+        rows = Export().text(ROWS).split("\r\n")
+        self.check(tmp_path, "\r\n".join([rows[0], *rows[6:]]), "export with header information")
+        self.check(tmp_path, "\r\n".join(rows[:6]), "no row that starts with 'Frame'")
+        self.check(tmp_path, "\r\n".join(rows[:7]) + "\r\n", "the take has no frames")
+
+
+class TestRecordedTakes:
+    def test_version_1_21(self):
+        take = read_take(real_take("hmv-s16_v121_quat_m_rb_rbm_marker.csv"))
+        (body,) = take.bodies
+        assert (take.version, len(take.time), take.exported_count) == ("1.21", 250, 250)
+        assert take.start == datetime(2016, 1, 5, 15, 49, 50, 755000, tzinfo=UTC)
+        assert body.seen.all()
+        np.testing.assert_allclose(body.position[0], [0.060002, -0.076611, 0.019150])
+        assert np.median(body.mean_error) < 1e-4
+
+    def test_version_1_23_with_three_bodies_and_drop_outs(self):
+        take = read_take(real_take("pathviewr_v123_quat_m_3rb.csv"))
+        assert [body.name for body in take.bodies] == ["device02", "device03", "device05"]
+        assert (len(take.time), take.exported_count) == (934, 190951)
+        assert (np.diff(take.frame) > 1).sum() == 4
+        np.testing.assert_allclose(take.time, take.frame / 100.0)
+        assert 740 < take.body("device05").seen.sum() < 760
+        for body in take.bodies:
+            assert np.isnan(body.position[~body.seen]).any(axis=1).all() or body.seen.all()
+            assert (np.abs(body.position[body.seen]).max(axis=1) > 1e-3).all()
+
+    def test_a_take_without_a_body(self):
+        take = read_take(real_take("pathviewr_v123_xyz_m_unlabeled_dropouts.csv"))
+        assert take.bodies == ()
+        with pytest.raises(UnknownBodyError, match="it has: none"):
+            take.body("scope")
