@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "check = knee_gap_replay.check:main",
+            "import_motive = knee_gap_replay.import_motive:main",
             "play = knee_gap_replay.play_node:main",
             "process = knee_gap_replay.process:main",
             "record = knee_gap_replay.record_node:main",
