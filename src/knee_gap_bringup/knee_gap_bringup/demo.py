@@ -30,7 +30,7 @@ START_TIMEOUT = 120.0
 DRAIN = 1.0
 
 
-def play_through_nodes(bag: Path, out: Path, begin: float) -> Path:
+def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) -> Path:
     """Play `bag` through the live nodes; return the recording of their output. Raises StartError."""
     recording = out / RECORDING
     # A domain of its own: another demo or a robot on this machine must not be heard.
@@ -39,6 +39,9 @@ def play_through_nodes(bag: Path, out: Path, begin: float) -> Path:
         processes.start("record", [executable("knee_gap_replay", "record"), str(recording), *RECORDED])
         for node, package in NODES.items():
             command = [executable(package, node), "--ros-args", "-r", f"__ns:={NAMESPACE}"]
+            if rate != 1.0:
+                # Waiting is then measured by the bag's clock.
+                command += ["-p", "use_sim_time:=true"]
             if node == "tracking_node":
                 command += ["--params-file", str(bag / PARAMETERS_FILE)]
             if node == "segmentation_node":
@@ -48,10 +51,12 @@ def play_through_nodes(bag: Path, out: Path, begin: float) -> Path:
         topics = [IMAGE, CAMERA_INFO, BODY_POSE]
         # A second in which the recorder finds the nodes.
         play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "1"]
+        if rate != 1.0:
+            play += ["--clock", "--rate", str(rate)]
         processes.start("play", [*play, "--wait-for", *topics])
+        pace = "in real time" if rate == 1.0 else f"at {rate:g} times its rate"
         print(
-            f"demo: nodes ready after {time.monotonic() - begin:.1f} s; playing {bag.name} in real time",
-            flush=True,
+            f"demo: nodes ready after {time.monotonic() - begin:.1f} s; playing {bag.name} {pace}", flush=True
         )
         if processes.wait("play") != 0:
             raise StartError(f"play failed: {processes.last_words('play')}")
@@ -63,7 +68,7 @@ def play_through_nodes(bag: Path, out: Path, begin: float) -> Path:
     return recording
 
 
-def run(bag: Path, out: Path) -> None:
+def run(bag: Path, out: Path, rate: float) -> None:
     """Play, record, compare and draw."""
     begin = time.monotonic()
     with BagReader(bag) as reader:  # refuses what is no bag before anything is started or removed
@@ -73,7 +78,7 @@ def run(bag: Path, out: Path) -> None:
         raise BagError(f"{bag} has no {PARAMETERS_FILE}, which says where the lens sits on the tracked body")
     out.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out / RECORDING, ignore_errors=True)
-    recording = play_through_nodes(bag, out, begin)
+    recording = play_through_nodes(bag, out, begin, rate)
     comparison = compare(bag, recording)
     write_gap_plot(comparison, out / "gap.png", f"knee_gap, live: {bag.name}")
     print(f"demo: {recording} and {out / 'gap.png'} written, {time.monotonic() - begin:.1f} s in all")
@@ -85,9 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="demo", description=__doc__)
     parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="simulated bag to play")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
+    parser.add_argument("--rate", type=float, default=1.0, help="times as fast as recorded")
     arguments = parser.parse_args(argv)
     try:
-        run(arguments.bag, arguments.out)
+        run(arguments.bag, arguments.out, arguments.rate)
     except (BagError, SimulationError, StartError, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1

@@ -1,8 +1,8 @@
 """The estimator: posed observations of the two edges go in, estimates with bounds come out.
 
 The live node, the offline processing of a bag and the simulation run this same object; only what feeds it
-differs. It waits for nothing and reads no clock: whoever feeds it says when each message arrived, on a
-clock that does not run backwards, and calls `advance` when time passes without one.
+differs. It waits for nothing and reads no clock: whoever feeds it says when each message arrived, and
+calls `advance` when time passes without one.
 """
 
 from collections import Counter, deque
@@ -39,9 +39,11 @@ class GapEstimator:
         self._frame_id = ""
         self._last_edges: Pending | None = None
         self._silence_told_ns = 0
+        self._now_ns = 0
 
     def add_pose(self, pose: LensPose, arrival_ns: int) -> list[GapEstimate]:
         """Take a lens pose; return the estimates that it made possible."""
+        self._turn_clock(arrival_ns)
         refusal = self._poses.add(pose)
         if refusal is not None:
             self.counts[f"pose refused: {refusal.value}"] += 1
@@ -51,6 +53,7 @@ class GapEstimator:
 
     def add_edges(self, edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
         """Take the edges of one image; return the estimates that are ready."""
+        self._turn_clock(arrival_ns)
         if self._last_edges is not None and edges.stamp_ns <= self._last_edges.edges.stamp_ns:
             self.counts["stamps ran backwards"] += 1
             self._pending.clear()
@@ -65,6 +68,7 @@ class GapEstimator:
 
     def advance(self, now_ns: int) -> list[GapEstimate]:
         """Let time pass; return the estimates that must not wait any longer, and what silence means."""
+        self._turn_clock(now_ns)
         estimates = self._resolve(now_ns)
         if self._last_edges is None or self._pending:
             return estimates
@@ -76,6 +80,16 @@ class GapEstimator:
             stamp_ns = last.edges.stamp_ns + now_ns - last.arrival_ns
             estimates.append(self._without(stamp_ns, GapStatus.NO_EDGES, 0, "no edges arrive"))
         return estimates
+
+    def _turn_clock(self, now_ns: int) -> None:
+        """Take the time; where it runs backwards (a bag that starts again) nothing waits any longer."""
+        if now_ns < self._now_ns:
+            self.counts["clock ran backwards"] += 1
+            self._pending.clear()
+            if self._last_edges is not None:
+                self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
+                self._silence_told_ns = now_ns
+        self._now_ns = now_ns
 
     def _resolve(self, now_ns: int) -> list[GapEstimate]:
         """Estimates of every pending image, in order, up to the first that may still wait for its pose."""

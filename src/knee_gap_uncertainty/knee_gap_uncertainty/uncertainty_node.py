@@ -1,6 +1,5 @@
 """uncertainty_node: gap_edges and scope_pose in; gap, gap/min, gap/max and gap/snr out."""
 
-import time
 from collections.abc import Mapping, Sequence
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -17,8 +16,8 @@ from knee_gap_uncertainty.gap_range import warm_up
 
 # A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
 GAP_DEADLINE = Duration(nanoseconds=100_000_000)
-# How often time is let pass when no message does it.
-TICK = 0.005
+# How often time is let pass when no message does it [s].
+TICK = 0.01
 
 
 class UncertaintyNode(BaseNode):
@@ -40,17 +39,19 @@ class UncertaintyNode(BaseNode):
         }
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
-        self._tick = self.create_timer(
-            TICK, lambda: self.publish(self._estimator.advance(time.monotonic_ns()))
-        )
+        self._tick = self.create_timer(TICK, lambda: self.publish(self._estimator.advance(self.now_ns())))
 
     def on_edges(self, message: GapEdges) -> None:
         """Estimate at an image."""
-        self.publish(self._estimator.add_edges(messages.edges_from_message(message), time.monotonic_ns()))
+        self.publish(self._estimator.add_edges(messages.edges_from_message(message), self.now_ns()))
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Take a lens pose, which may complete images that waited for it."""
-        self.publish(self._estimator.add_pose(messages.pose_from_message(message), time.monotonic_ns()))
+        self.publish(self._estimator.add_pose(messages.pose_from_message(message), self.now_ns()))
+
+    def now_ns(self) -> int:
+        """Time by which waiting is measured; with use_sim_time the bag's, so that slow replay waits longer."""
+        return int(self.get_clock().now().nanoseconds)
 
     def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
         """Publish each estimate; the plain numbers only where they are valid."""
