@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "make_bag = knee_gap_simulation.make_bag:main",
+            "natnet_server = knee_gap_simulation.natnet_server:main",
         ],
     },
 )
