@@ -27,6 +27,7 @@ from knee_gap_replay.types import full_name, known_type, typestore
 
 # DDS pads what it sends; a bag written here and played and recorded again then has the same bytes.
 _DDS_ALIGNMENT = 4
+_CONVERT = "convert it first: rosbags-convert --src IN --dst OUT --dst-storage mcap"
 _STAMP_END = 12
 _HEADER_FIELD = ("header", (Nodetype.NAME, "std_msgs/msg/Header"))
 
@@ -86,7 +87,10 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.close()
+        try:
+            self._writer.close()
+        except OSError as failure:
+            raise BagError(f"{self.path} cannot be finished: {failure.strerror}") from failure
 
     @property
     def counts(self) -> dict[str, int]:
@@ -177,10 +181,13 @@ class BagReader:
         for file in self._files:
             file.close()
 
-    @property
-    def message_count(self) -> int:
-        """Messages in the bag, as its index tells it; 0 where it has none."""
-        return sum(block.message_count for file in self._files for block in file.blocks)
+    def count(self, topics: Collection[str] | None = None) -> int | None:
+        """Return the number of messages of `topics`, as the index tells it; None where there is none."""
+        counts = [file.counts for file in self._files]
+        if any(count is None for count in counts):
+            return None
+        wanted = self.topics if topics is None else topics
+        return sum(count[topic] for count in counts if count is not None for topic in wanted)
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -256,11 +263,9 @@ class BagReader:
             self._missing.append("metadata.yaml is damaged; read without it")
             return {}
         if storage != "mcap":
-            raise BagError(f"{self.path} is stored as {storage}; convert it to mcap first (ros2 bag convert)")
+            raise BagError(f"{self.path} is stored as {storage}; {_CONVERT}")
         if mode.lower() != "none":
-            raise BagError(
-                f"{self.path} is compressed by {mode.lower()}; convert it first (ros2 bag convert)"
-            )
+            raise BagError(f"{self.path} is compressed by {mode.lower()}; {_CONVERT}")
         return dict(information)
 
     def _note_metadata(self) -> None:

@@ -6,11 +6,15 @@ import math
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from typing import NoReturn
+from collections.abc import Callable, Iterable, Sequence
+from typing import NoReturn, TypeVar
+
+from tqdm import tqdm
 
 from knee_gap_node.errors import ConfigurationError
 from knee_gap_replay.errors import BagError
+
+Item = TypeVar("Item")
 
 
 class Parser(argparse.ArgumentParser):
@@ -48,11 +52,19 @@ def run(
     logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
     try:
         return command(arguments)
-    except (BagError, ConfigurationError) as error:
+    except (BagError, ConfigurationError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
+
+
+def with_progress(messages: Iterable[Item], total: int | None) -> Iterable[Item]:
+    """Return the messages, with a bar on a terminal while they are taken."""
+    bar: Iterable[Item] = tqdm(
+        messages, total=total, unit=" messages", disable=not sys.stderr.isatty(), leave=False
+    )
+    return bar
 
 
 def stop_on_signals() -> threading.Event:

@@ -9,6 +9,7 @@ import logging
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -56,8 +57,9 @@ class Entry(NamedTuple):
 class McapFile:
     """The readable part of one MCAP file.
 
-    `losses` has one line for each part that is not readable; it grows while blocks are read. Raises BagError
-    where the file is no MCAP file at all or cannot be opened.
+    `counts` are the messages by topic, as the index tells them; None without one. `losses` has one line for
+    each part that is not readable; it grows while blocks are read. Raises BagError where the file is no MCAP
+    file at all or cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,6 +69,7 @@ class McapFile:
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.blocks: list[Block] = []
+        self.counts: Counter[str] | None = None
         try:
             self._size = path.stat().st_size
             self._file: BinaryIO = path.open("rb")
@@ -114,6 +117,10 @@ class McapFile:
         if summary is not None:
             self.schemas.update(summary.schemas)
             self.channels.update(summary.channels)
+            if summary.statistics is not None:
+                self.counts = Counter()
+                for channel, count in summary.statistics.channel_message_counts.items():
+                    self.counts[summary.channels[channel].topic] += count
         else:
             for block in self.blocks:
                 if block.is_chunk:

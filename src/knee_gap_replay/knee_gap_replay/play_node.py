@@ -22,7 +22,7 @@ from rosgraph_msgs.msg import Clock
 from knee_gap_node.parameters import refuse_unknown
 from knee_gap_replay import qos as qos_profiles
 from knee_gap_replay.bag import BagReader, Topic
-from knee_gap_replay.command_line import Parser, not_negative, positive, run, stop_on_signals
+from knee_gap_replay.command_line import Parser, not_negative, positive, run, stop_on_signals, with_progress
 from knee_gap_replay.errors import BagError
 from knee_gap_replay.playback import Event, Pace, Played, play_once, with_clock, without_clock
 from knee_gap_replay.types import check_type_hash, message_class
@@ -107,7 +107,7 @@ def _play(node: PlayNode, reader: BagReader, arguments: argparse.Namespace, stop
     begin_ns = time.monotonic_ns()
     count = latest_ns = 0
     while True:
-        messages = reader.messages(node.topics)
+        messages = with_progress(reader.messages(node.topics), reader.count(node.topics))
         events = with_clock(messages) if arguments.clock else without_clock(messages)
         pace = Pace(begin_ns, arguments.rate)
         played = play_once(events, pace, node.emit, time.monotonic_ns, stop.wait)

@@ -5,13 +5,11 @@ Messages are fed by their header's stamp, none is dropped, and the same bag give
 
 import heapq
 import logging
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from tqdm import tqdm
-
 from knee_gap_replay.bag import BagMessage, BagReader, BagWriter
+from knee_gap_replay.command_line import with_progress
 from knee_gap_replay.errors import BagError
 from knee_gap_replay.qos import QosName
 
@@ -95,7 +93,7 @@ def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[st
         raise BagError(f"{reader.path} has no topic {', '.join(missing)}; it has {names}")
     for topic, (msgtype, qos) in pipeline.outputs.items():
         writer.add_topic(topic, msgtype, qos)
-    for stamped in _with_progress(by_stamp(reader, pipeline.inputs)):
+    for stamped in with_progress(by_stamp(reader, pipeline.inputs), reader.count(pipeline.inputs)):
         try:
             message = reader.deserialize(stamped.message)
         except BagError as error:
@@ -110,8 +108,3 @@ def _write(writer: BagWriter, outputs: Iterable[Output]) -> None:
     for topic, message, stamp_ns in outputs:
         # Not the time of writing, so that the same bag gives the same bytes.
         writer.write(topic, message, stamp_ns)
-
-
-def _with_progress(messages: Iterable[Stamped]) -> Iterable[Stamped]:
-    bar: Iterable[Stamped] = tqdm(messages, unit=" messages", disable=not sys.stderr.isatty(), leave=False)
-    return bar
