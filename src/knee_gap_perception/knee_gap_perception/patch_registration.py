@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_perception.patch_kernel import normal_equations
+
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
@@ -23,10 +25,11 @@ FAINT = 0.01  # [-] contrast of detail added to the local one: noise must not lo
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
+WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
-NOISE_CORRELATION = 6.0  # factor on the variance: the residuals of neighbouring pixels are not independent
+NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
-CONVERGED = 0.01  # [px]
+CONVERGED = 0.02  # [px]
 
 
 @dataclass(frozen=True)
@@ -105,25 +108,26 @@ class Patch:
     def __init__(self, surface: Surface, position: Array, half_size: int) -> None:
         """Take the patch of side 2 half_size + 1 around a pixel (2,)."""
         self.half_size = half_size
-        identity = Warp(position, np.eye(2))
-        self._grid = _grid(half_size)
-        self.texture = _sample(surface.texture, surface, identity, self._grid)
-        seen = _sample(surface.weight, surface, identity, self._grid)
-        q = self._grid
-        window = np.exp(-(q**2).sum(axis=-1) / (2 * (0.55 * half_size) ** 2)).astype(np.float32)
-        self.weight = seen * window
+        matrix = self._matrix(surface, Warp(position, np.eye(2)))
+        side = 2 * half_size + 1
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        self.texture = cv2.warpAffine(surface.texture, matrix, (side, side), flags=flags).astype(np.float32)
+        seen = cv2.warpAffine(surface.weight, matrix, (side, side), flags=flags)
+        line = np.arange(-half_size, half_size + 1, dtype=np.float32)
+        fall = np.exp(-(line**2) / (2 * (WINDOW * half_size) ** 2))
+        window = np.outer(fall, fall)
+        self.weight = (seen * window).astype(np.float32)
         self.coverage = float(self.weight.sum() / window.sum())
         dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
         dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
-        x, y = q[..., 0], q[..., 1]
-        # Columns: shift x, shift y, shape xx, xy, yx, yy, gain.
-        steepest = np.stack([dx, dy, dx * x, dx * y, dy * x, dy * y, self.texture], axis=-1)
-        self._steepest = steepest.reshape(-1, 7).astype(np.float32)
+        # Neighbours tell nearly the same: every other pixel, as on a chessboard, costs no accuracy.
+        chessboard = np.indices((side, side)).sum(axis=0) % 2 == 0
+        self._pixels = np.stack([self.texture, dx, dy, self.weight * chessboard], axis=-1).astype(np.float32)
 
     def information(self) -> Array:
         """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift."""
-        gradient = self._steepest[:, :2] * np.sqrt(self.weight.reshape(-1, 1))
-        return np.asarray(gradient.T @ gradient, dtype=np.float64)
+        gradient = self._pixels[..., 1:3].reshape(-1, 2).astype(np.float64)
+        return np.asarray(gradient.T @ (gradient * self.weight.reshape(-1, 1)))
 
     def find(self, surface: Surface, start: Warp, prior: Array) -> Registration:
         """The patch in another image, from a predicted warp with the covariance (6, 6) of its parameters.
@@ -131,7 +135,7 @@ class Patch:
         The parameters are position x, y [px] and shape xx, xy, yx, yy [-].
         """
         # A step s of the patch changes the warp's parameters by -jacobian s.
-        jacobian = np.kron(np.eye(3), np.eye(2))
+        jacobian = np.zeros((6, 6))
         jacobian[:2, :2] = start.shape
         jacobian[2:, 2:] = np.kron(start.shape, np.eye(2))
         prior_information = np.zeros((7, 7))
@@ -139,70 +143,32 @@ class Patch:
         prior_information[6, 6] = 1.0 / GAIN_PRIOR**2
         warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
         for _ in range(MAXIMUM_ITERATIONS):
-            residual, weight = self._residual(surface, warp, gain)
-            noise = _spread(residual, weight)
-            weighted = self._steepest * (weight * _robust(residual, noise))[:, None]
-            precision = 1.0 / (NOISE_CORRELATION * noise**2)
-            hessian = (self._steepest.T @ weighted).astype(np.float64) * precision
-            slope = (weighted.T @ residual).astype(np.float64) * precision
-            step = np.linalg.solve(hessian + prior_information, slope - prior_information @ deviation)
+            hessian, slope, told = self._look(surface, warp, gain)
+            precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2)
+            posterior = hessian * precision + prior_information
+            step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
             deviation += step
-            gain = float(np.clip(gain + step[6], 0.3, 3.0))
+            gain = min(max(gain + float(step[6]), 0.3), 3.0)
             warp = _compose(warp, step[:6])
             if (
-                np.linalg.norm(warp.shape @ step[:2]) < CONVERGED
-                and np.abs(step[2:6]).max() * self.half_size < 0.1
+                np.abs(step[:2]).max() < CONVERGED
+                and np.abs(step[2:6]).max() * self.half_size < 5 * CONVERGED
             ):
                 converged = True
                 break
-        covariance = jacobian @ np.linalg.inv(hessian + prior_information)[:6, :6] @ jacobian.T
-        return self._judge(surface, warp, gain, noise, (covariance + covariance.T) / 2, converged)
+        covariance = jacobian @ np.linalg.inv(posterior)[:6, :6] @ jacobian.T
+        told = self._look(surface, warp, gain)[2]
+        return Registration(warp, (covariance + covariance.T) / 2, float(told[2]), float(told[1]), converged)
 
-    def _residual(self, surface: Surface, warp: Warp, gain: float) -> tuple[Float32, Float32]:
-        """Difference of the warped image from the patch (n,) and its weight (n,)."""
-        seen = _sample(surface.weight, surface, warp, self._grid)
-        texture = _sample(surface.texture, surface, warp, self._grid)
-        return (texture - np.float32(gain) * self.texture).reshape(-1), (self.weight * seen).reshape(-1)
+    def _look(self, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
+        return normal_equations(
+            self._pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain
+        )
 
-    def _judge(
-        self, surface: Surface, warp: Warp, gain: float, noise: float, covariance: Array, converged: bool
-    ) -> Registration:
-        residual, weight = self._residual(surface, warp, gain)
-        share = float(weight.sum()) / max(float(self.weight.sum()), 1e-9)
-        weight = weight * _robust(residual, noise)
-        a = self.texture.reshape(-1).astype(np.float64)
-        b = residual.astype(np.float64) + gain * a
-        mass = max(float(weight.sum()), 1e-9)
-        a, b = a - (weight * a).sum() / mass, b - (weight * b).sum() / mass
-        norm = np.sqrt((weight * a * a).sum() * (weight * b * b).sum())
-        correlation = float((weight * a * b).sum() / norm) if norm > 0 else 0.0
-        return Registration(warp, covariance, correlation, share, converged)
-
-
-def _robust(residual: Float32, noise: float) -> Float32:
-    """Geman and McClure's weight of residuals: debris and highlights are no texture of the surface."""
-    return np.asarray(1.0 / (1.0 + (residual / np.float32(3.0 * noise)) ** 2) ** 2, dtype=np.float32)
-
-
-def _grid(half_size: int) -> Float32:
-    """Offsets (n, n, 2) of the pixels of a patch from its centre."""
-    line = np.arange(-half_size, half_size + 1, dtype=np.float32)
-    x, y = np.meshgrid(line, line)
-    return np.stack([x, y], axis=-1)
-
-
-def _sample(values: Float32, surface: Surface, warp: Warp, grid: Float32) -> Float32:
-    """Values of a crop at the pixels that a warp sends the grid (n, n, 2) to; 0 outside the crop."""
-    shape = warp.shape.astype(np.float64)
-    offset = warp.position - np.array(surface.origin, dtype=np.float64)
-    # warpAffine takes (column, row) of the patch, counted from its corner, to those of the crop.
-    corner = offset + shape @ grid[0, 0].astype(np.float64)
-    matrix = np.concatenate([shape, corner[:, None]], axis=1)
-    side = grid.shape[0]
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(values, matrix, (side, side), flags=flags, borderValue=[0.0]), dtype=np.float32
-    )
+    def _matrix(self, surface: Surface, warp: Warp) -> Array:
+        """Matrix (2, 3) from a pixel of the patch (column, row) to one of the crop."""
+        corner = warp.position - np.array(surface.origin) - self.half_size * warp.shape.sum(axis=1)
+        return np.concatenate([warp.shape, corner[:, None]], axis=1)
 
 
 def _compose(warp: Warp, step: Array) -> Warp:
@@ -210,11 +176,3 @@ def _compose(warp: Warp, step: Array) -> Warp:
     change = np.eye(2) + np.clip(step[2:].reshape(2, 2), -0.3, 0.3)
     inverse = np.linalg.inv(change)
     return Warp(warp.position - warp.shape @ inverse @ step[:2], warp.shape @ inverse)
-
-
-def _spread(residual: Float32, weight: Float32) -> float:
-    """Robust standard deviation of the residuals that have weight."""
-    used = np.abs(residual[weight > 0.05])
-    if used.size < 16:
-        return 1.0
-    return max(1.4826 * float(np.median(used)), 0.05)

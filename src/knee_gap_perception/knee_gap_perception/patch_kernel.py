@@ -1,0 +1,147 @@
+"""The inner loop of patch registration, compiled: one pass over the pixels of a patch."""
+
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+
+SPREAD_BINS = 512  # of the histogram that gives the median of the residuals
+SPREAD_LIMIT = 6.0  # [-] largest residual in it; textures have unit contrast
+MINIMUM_SPREAD = 0.05  # [-]
+ROBUST = 3.0  # standard deviations at which a residual counts for a quarter
+
+
+def _sample(
+    patch: Float32,
+    texture: Float32,
+    weight: Float32,
+    matrix: Array,
+    gain: float,
+    residual: Float32,
+    mass: Float32,
+) -> None:
+    """Fill `residual` and `mass` (n, n) for a warp (2, 3) from a pixel of the patch to one of the crop.
+
+    `patch` (n, n, 4) holds texture, its derivative along x and y, and weight.
+    """
+    rows, columns = texture.shape
+    for i in range(patch.shape[0]):
+        for j in range(patch.shape[1]):
+            residual[i, j] = 0.0
+            mass[i, j] = 0.0
+            own = patch[i, j, 3]
+            if own <= 0.0:
+                continue
+            x = matrix[0, 0] * j + matrix[0, 1] * i + matrix[0, 2]
+            y = matrix[1, 0] * j + matrix[1, 1] * i + matrix[1, 2]
+            if not (0.0 <= x < columns - 1 and 0.0 <= y < rows - 1):
+                continue
+            left, top = int(x), int(y)
+            fx, fy = x - left, y - top
+            a, b = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy)
+            c, d = (1.0 - fx) * fy, fx * fy
+            seen = (
+                a * weight[top, left]
+                + b * weight[top, left + 1]
+                + c * weight[top + 1, left]
+                + d * weight[top + 1, left + 1]
+            )
+            value = (
+                a * texture[top, left]
+                + b * texture[top, left + 1]
+                + c * texture[top + 1, left]
+                + d * texture[top + 1, left + 1]
+            )
+            residual[i, j] = value - gain * patch[i, j, 0]
+            mass[i, j] = own * seen
+
+
+def _spread(residual: Float32, mass: Float32) -> float:
+    """Robust standard deviation of the residuals: their median size, from a histogram, for a normal law."""
+    counts = np.zeros(SPREAD_BINS)
+    total = 0.0
+    for i in range(residual.shape[0]):
+        for j in range(residual.shape[1]):
+            if mass[i, j] > 0.0:
+                size = min(abs(residual[i, j]) / SPREAD_LIMIT, 0.999999)
+                counts[int(size * SPREAD_BINS)] += mass[i, j]
+                total += mass[i, j]
+    if total <= 0.0:
+        return 1.0
+    below = 0.0
+    for k in range(SPREAD_BINS):
+        if below + counts[k] >= 0.5 * total:
+            place = (k + (0.5 * total - below) / counts[k]) * SPREAD_LIMIT / SPREAD_BINS
+            return float(max(1.4826 * place, MINIMUM_SPREAD))
+        below += counts[k]
+    return 1.0
+
+
+def _normal_equations(
+    patch: Float32, texture: Float32, weight: Float32, matrix: Array, gain: float
+) -> tuple[Array, Array, Array]:
+    """Hessian (7, 7) and slope (7,) of the robust squares, and what there was to see (4,).
+
+    Parameters: shift x, y, shape xx, xy, yx, yy, gain. Seen were: the spread of the residuals, the share of
+    the patch that is surface, the correlation of the textures, and the share that keeps its robust weight.
+    """
+    n = patch.shape[0]
+    half = n // 2
+    residual = np.empty((n, n), np.float32)
+    mass = np.empty((n, n), np.float32)
+    sample(patch, texture, weight, matrix, gain, residual, mass)
+    noise = spread(residual, mass)
+    hessian, slope, column = np.zeros((7, 7)), np.zeros(7), np.zeros(7)
+    seen = whole = kept = 0.0
+    sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
+    for i in range(n):
+        for j in range(n):
+            whole += patch[i, j, 3]
+            m = mass[i, j]
+            if m <= 0.0:
+                continue
+            seen += m
+            r = residual[i, j]
+            share = r / (ROBUST * noise)
+            w = m / (1.0 + share * share) ** 2
+            kept += w
+            t, dx, dy = patch[i, j, 0], patch[i, j, 1], patch[i, j, 2]
+            qx, qy = j - half, i - half
+            column[0], column[1] = dx, dy
+            column[2], column[3] = dx * qx, dx * qy
+            column[4], column[5] = dy * qx, dy * qy
+            column[6] = t
+            for k in range(7):
+                weighted = w * column[k]
+                slope[k] += weighted * r
+                for other in range(k, 7):
+                    hessian[k, other] += weighted * column[other]
+            value = r + gain * t
+            sum_a += w * t
+            sum_b += w * value
+            sum_aa += w * t * t
+            sum_bb += w * value * value
+            sum_ab += w * t * value
+    for k in range(7):
+        for other in range(k):
+            hessian[k, other] = hessian[other, k]
+    told = np.array([noise, 0.0, 0.0, 0.0])
+    if whole > 0.0 and kept > 0.0:
+        told[1] = seen / whole
+        told[3] = kept / whole
+        power = (sum_aa - sum_a * sum_a / kept) * (sum_bb - sum_b * sum_b / kept)
+        if power > 0.0:
+            told[2] = (sum_ab - sum_a * sum_b / kept) / np.sqrt(power)
+    return hessian, slope, told
+
+
+# No fast arithmetic: the same pixels must give the same bits.
+sample = numba.njit(cache=True)(_sample)
+spread = numba.njit(cache=True)(_spread)
+normal_equations: Callable[[Float32, Float32, Float32, Array, float], tuple[Array, Array, Array]] = (
+    numba.njit(cache=True)(_normal_equations)
+)
