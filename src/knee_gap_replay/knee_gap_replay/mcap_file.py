@@ -94,7 +94,14 @@ class McapFile:
             self._lose(f"{block.message_count or 'all'} messages at byte {block.offset} lost: {reason}")
             return []
         self._note_definitions(records)
-        return [self._entry(record) for record in records if isinstance(record, Message)]
+        messages = [record for record in records if isinstance(record, Message)]
+        # Without an index a topic is announced in one chunk only, and that may be the damaged one.
+        told = [message for message in messages if message.channel_id in self.channels]
+        if len(told) < len(messages):
+            self._lose(
+                f"{len(messages) - len(told)} messages at byte {block.offset} lost: their topic is not told"
+            )
+        return [self._entry(message) for message in told]
 
     def _entry(self, message: Message) -> Entry:
         channel = self.channels[message.channel_id]
@@ -119,8 +126,9 @@ class McapFile:
             self.channels.update(summary.channels)
             if summary.statistics is not None:
                 self.counts = Counter()
-                for channel, count in summary.statistics.channel_message_counts.items():
-                    self.counts[summary.channels[channel].topic] += count
+                for number, count in summary.statistics.channel_message_counts.items():
+                    if (channel := summary.channels.get(number)) is not None:
+                        self.counts[channel.topic] += count
         else:
             for block in self.blocks:
                 if block.is_chunk:

@@ -108,6 +108,18 @@ def test_a_recording_that_was_killed_keeps_its_metadata(
         assert list(reader.messages()) == original[:32]
 
 
+def test_messages_of_a_topic_whose_announcement_is_lost_are_lost_and_told(
+    whole: tuple[bytes, list[BagMessage]], tmp_path: Path
+) -> None:
+    content, original = whole
+    place = content.index(original[0].data)
+    flipped = content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+    # Killed in its third chunk, and its first, the only one with definitions, damaged.
+    messages, losses = read(tmp_path / "killed.mcap", flipped[: content.index(original[40].data)])
+    assert messages == []
+    assert any("16 messages at byte" in line and "topic is not told" in line for line in losses)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
