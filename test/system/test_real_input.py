@@ -100,7 +100,7 @@ def draw_contact_sheet(bag: Path, edges: dict[int, Any], path: Path) -> None:
             if told is not None and told.status == GapEdges.STATUS_VALID:
                 for pixel, colour in ((told.pixel_0, (80, 220, 80)), (told.pixel_1, (80, 160, 255))):
                     centre = tuple(round(v) for v in pixel)
-                    cv2.circle(picture, centre, 16, colour, 5, cv2.LINE_AA)
+                    cv2.circle(picture, centre, 28, colour, 9, cv2.LINE_AA)
                 status += f", track {told.track_id}"
             small = cv2.resize(picture, (480, 270), interpolation=cv2.INTER_AREA)
             cv2.putText(

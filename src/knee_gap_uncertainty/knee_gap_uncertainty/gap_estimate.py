@@ -78,5 +78,5 @@ class GapEstimate:
     view_count: int = 0
     translation_to_target: float = NAN
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
-    shares: tuple[float, float, float, float] = (NAN,) * 4
+    shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(4, NAN))
     reason: str = ""

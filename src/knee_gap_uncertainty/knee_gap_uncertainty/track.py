@@ -1,11 +1,11 @@
 """One track: the two points of the anatomy from their first view to the present one."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
+from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.errors import (
     MeasurementError,
     ParallelToTravelError,
@@ -15,44 +15,42 @@ from knee_gap_uncertainty.errors import (
 )
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
+from knee_gap_uncertainty.view_window import ViewWindow
 
-# Why two views give no range, without the numbers: a reason that is counted must stay the same.
+# Why views give no number, without the values: a reason that is counted must stay the same.
 REASONS: dict[type[MeasurementError], str] = {
     TravelTooShortError: "the scope has hardly moved",
     ParallelToTravelError: "a point lies along the scope's travel",
     RaysMeetBehindError: "the rays to a point do not meet in front of the scope",
     UnboundedError: "the rays to a point are parallel",
 }
+UNBOUNDED = "the admitted errors leave the gap unbounded"
+UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
+CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
 
-Floats = npt.NDArray[np.float64]
 
+class AllViews(NamedTuple):
+    """The fit over all views, and the confidence interval that it gives."""
 
-class View(NamedTuple):
-    """One view in the frame of the poses: lens (3,), bearings (2, 3), and the bounds of their errors.
-
-    `angular_error` is psi = theta + omega [rad], `translation_error` DT [m].
-    """
-
-    stamp_ns: int
-    lens: Floats
-    bearings: Floats
-    angular_error: float
-    translation_error: float
+    fit: MultiViewFit
+    interval: ConfidenceInterval
 
 
 class Track:
-    """Keeps the first view as A0 and measures from it at every later one."""
+    """Keeps the first view as A0 for the bounds, and views from all along the way for the estimate."""
 
     def __init__(self, track_id: int, frame_id: str, parameters: EstimatorParameters) -> None:
         self.track_id = track_id
         self.frame_id = frame_id
         self._parameters = parameters
-        self._first: View | None = None
-        self._view_count = 0
+        self._first: PosedView | None = None
+        self._window = ViewWindow()
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
         """Whether the edges are of the same two points and the pose of the same reference frame."""
@@ -60,71 +58,81 @@ class Track:
 
     def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
-        view = view_of(edges, pose, self._parameters.tracker_bound)
-        if self._first is None:
-            self._first = view
-        self._view_count += 1
-        baseline = float(np.linalg.norm(view.lens - self._first.lens))
-        try:
-            return self._measure(self._first, view, baseline)
-        except MeasurementError as error:
-            return self._refuse(view, baseline, REASONS.get(type(error), str(error)))
-
-    def _measure(self, first: View, view: View, baseline: float) -> GapEstimate:
-        bounds = gap_range(
-            first.lens,
-            view.lens,
-            first.bearings,
-            view.bearings,
-            angular_error=max(first.angular_error, view.angular_error),
-            translation_error=max(first.translation_error, view.translation_error),
-            interval=self._parameters.interval,
-            apex=self._parameters.apex,
-        )
-        two = triangulate(two_views(first.lens, view.lens, first.bearings, view.bearings))
-        if not np.isfinite(bounds.gap_max):
-            return self._refuse(view, baseline, "the admitted errors leave the gap unbounded", bounds.gap_min)
-        return GapEstimate(
-            stamp_ns=view.stamp_ns,
-            frame_id=self.frame_id,
-            status=GapStatus.VALID,
-            track_id=self.track_id,
-            interval=self._parameters.interval,
-            gap=bounds.gap,
-            gap_min=bounds.gap_min,
-            gap_max=bounds.gap_max,
-            snr=bounds.snr,
-            baseline=baseline,
-            parallax=float(np.min(two.gamma)),
-            view_count=self._view_count,
-            points=two.points_second,
-        )
-
-    def _refuse(self, view: View, baseline: float, reason: str, gap_min: float = np.nan) -> GapEstimate:
-        return GapEstimate(
-            stamp_ns=view.stamp_ns,
+        blank = GapEstimate(
+            stamp_ns=edges.stamp_ns,
             frame_id=self.frame_id,
             status=GapStatus.INSUFFICIENT_PARALLAX,
             track_id=self.track_id,
             interval=self._parameters.interval,
-            gap_min=gap_min,
-            gap_max=np.inf if np.isfinite(gap_min) else np.nan,
-            snr=0.0 if np.isfinite(gap_min) else np.nan,
-            baseline=baseline,
-            view_count=self._view_count,
-            reason=reason,
+            confidence_level=self._parameters.confidence_level,
+        )
+        try:
+            view = posed_view(edges, pose, self._parameters.tracker_bound)
+        except MeasurementError as error:
+            return replace(blank, status=GapStatus.NO_EDGES, reason=str(error))
+        if self._first is None:
+            self._first = view
+        try:
+            all_views = self._all_views(view)
+            bounds, parallax = self._bounds(self._first, view)
+        except MeasurementError as error:
+            return self._told(blank, view, REASONS.get(type(error), str(error)))
+        return self._measured(blank, view, bounds, parallax, all_views)
+
+    def _all_views(self, present: PosedView) -> AllViews:
+        """Fit over the views kept and the present one."""
+        kept = self._window.add(present.view)
+        views = self._window.views(self._parameters.common_share)
+        fitted = fit(views if kept else views.joined(present.view))
+        return AllViews(fitted, confidence_interval(fitted, self._parameters.confidence_level))
+
+    def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
+        """Bounds from the first and the present view, and the smaller parallax of the two points [rad]."""
+        bounds = gap_range(
+            first.lens,
+            present.lens,
+            first.bearings,
+            present.bearings,
+            angular_error=max(first.angular_error, present.angular_error),
+            translation_error=max(first.translation_error, present.translation_error),
+            interval=self._parameters.interval,
+            apex=self._parameters.apex,
+        )
+        views = two_views(first.lens, present.lens, first.bearings, present.bearings)
+        return bounds, float(np.min(triangulate(views).gamma))
+
+    def _measured(
+        self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews
+    ) -> GapEstimate:
+        fitted, interval = all_views
+        estimate = replace(
+            self._told(blank, view, ""),
+            gap_min=bounds.gap_min,
+            gap_max=bounds.gap_max,
+            snr=0.0,
+            confidence_min=interval.lower,
+            confidence_max=interval.upper,
+            parallax=parallax,
+            view_count=fitted.view_count,
+            shares=fitted.shares,
+        )
+        if not np.isfinite(bounds.gap_max):
+            return replace(estimate, reason=UNBOUNDED)
+        if interval.refused or not np.isfinite(fitted.gap):
+            # The lower bounds stand; an upper one must not be taken for an answer.
+            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCERTAIN_DEPTH)
+        if not bounds.gap_min <= fitted.gap <= bounds.gap_max:
+            return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
+        return replace(
+            estimate,
+            status=GapStatus.VALID,
+            gap=fitted.gap,
+            snr=fitted.gap / (bounds.gap_max - bounds.gap_min),
+            points=fitted.points,
         )
 
-
-def view_of(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> View:
-    """The view in the frame of the pose; tracked errors enter as `tracker_bound` times their RMS length."""
-    rotation = Rotation.from_quat(pose.quaternion_xyzw)
-    translation_rms = np.sqrt(np.trace(pose.covariance[:3, :3]))
-    rotation_rms = np.sqrt(np.trace(pose.covariance[3:, 3:]))
-    return View(
-        stamp_ns=edges.stamp_ns,
-        lens=pose.position,
-        bearings=rotation.apply(edges.bearings),
-        angular_error=edges.angular_error + tracker_bound * float(rotation_rms),
-        translation_error=tracker_bound * float(translation_rms),
-    )
+    def _told(self, blank: GapEstimate, view: PosedView, reason: str) -> GapEstimate:
+        """What is known of every view: how far the lens has come, and the reason why there is no more."""
+        assert self._first is not None
+        baseline = float(np.linalg.norm(view.lens - self._first.lens))
+        return replace(blank, baseline=baseline, view_count=len(self._window), reason=reason)

@@ -50,7 +50,7 @@ class UncertaintyNode(BaseNode):
         self.publish(self._estimator.add_pose(messages.pose_from_message(message), self.now_ns()))
 
     def now_ns(self) -> int:
-        """Time by which waiting is measured; with use_sim_time the bag's, so that slow replay waits longer."""
+        """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""
         return int(self.get_clock().now().nanoseconds)
 
     def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
