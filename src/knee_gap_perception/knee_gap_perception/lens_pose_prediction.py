@@ -1,0 +1,74 @@
+"""The pose of the lens at the stamp of an image, foretold where the tracker has not come so far yet.
+
+An image may be looked at before the tracker's next pose arrives. What is foretold only guides the search
+for the points in the image, so a pose with a larger, honest covariance is better than none.
+"""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from knee_gap_perception.poses import LensPose
+
+Array = npt.NDArray[np.float64]
+
+POSES = 3  # through which the motion is drawn
+LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion
+LONGEST_AHEAD_NS = 40_000_000  # beyond the last pose
+ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
+ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
+
+
+class LensPosePredictor:
+    """Takes lens poses in the order of their stamps and tells the pose at a stamp near the last of them."""
+
+    def __init__(self) -> None:
+        self._poses: deque[LensPose] = deque(maxlen=8 * POSES)
+
+    def add(self, pose: LensPose) -> None:
+        """Take the next pose; one of another frame, or from before the last, starts anew."""
+        if self._poses:
+            last = self._poses[-1]
+            if pose.frame_id != last.frame_id or pose.stamp_ns <= last.stamp_ns:
+                self._poses.clear()
+        self._poses.append(pose)
+
+    def at(self, stamp_ns: int) -> LensPose | None:
+        """The pose at a stamp [ns] with its covariance; None where no poses are close enough."""
+        near = self._motion(stamp_ns)
+        if len(near) < 2 or stamp_ns - near[-1].stamp_ns > LONGEST_AHEAD_NS or stamp_ns < near[0].stamp_ns:
+            return None
+        times = np.array([pose.stamp_ns - stamp_ns for pose in near]) / 1e9
+        # Value at time 0 of the line through the poses, as weights of the poses.
+        centred = times - times.mean()
+        weights = 1.0 / len(near) - times.mean() * centred / (centred @ centred)
+        reference = Rotation.from_quat(near[-1].quaternion_xyzw)
+        turns = np.stack(
+            [(Rotation.from_quat(p.quaternion_xyzw) * reference.inv()).as_rotvec() for p in near]
+        )
+        # A constant acceleration a adds a t^2 / 2 to each pose.
+        bend = abs(float(weights @ times**2)) / 2.0
+        curved = np.repeat([ACCELERATION, ANGULAR_ACCELERATION], 3) * bend
+        noise: Array = np.einsum("k,kij->ij", weights**2, np.stack([pose.covariance for pose in near]))
+        return LensPose(
+            stamp_ns=stamp_ns,
+            frame_id=near[-1].frame_id,
+            child_frame_id=near[-1].child_frame_id,
+            position=weights @ np.stack([pose.position for pose in near]),
+            quaternion_xyzw=(Rotation.from_rotvec(weights @ turns) * reference).as_quat(),
+            covariance=noise + np.diag(curved**2 / 3.0),
+        )
+
+    def _motion(self, stamp_ns: int) -> list[LensPose]:
+        """The poses that describe the motion around a stamp, up to the first that follows it."""
+        motion: list[LensPose] = []
+        for pose in self._poses:
+            if motion and pose.stamp_ns - motion[-1].stamp_ns > LONGEST_STEP_NS:
+                motion = []
+            if motion and motion[-1].stamp_ns >= stamp_ns:
+                break
+            motion.append(pose)
+        # Between two poses those two tell most; beyond the last, more of them level the noise.
+        return motion[-2:] if motion and motion[-1].stamp_ns >= stamp_ns else motion[-POSES:]
