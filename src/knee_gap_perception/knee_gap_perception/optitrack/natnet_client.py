@@ -106,12 +106,14 @@ class NatNetClient:
     def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
         """Return the frames that came since the last call; waits up to `timeout` [s] for the first."""
         end = time.monotonic() + timeout
+        # What waits is read first: after a pause of this process the server must not be taken for gone.
+        frames = self._receive(0.0)
         while True:
             self._send_due()
             left = end - time.monotonic()
-            frames = self._receive(max(0.0, min(left, STEP)))
             if frames or left <= 0.0:
                 return frames
+            frames = self._receive(min(left, STEP))
 
     def status(self) -> SourceStatus:
         """Return how the connection fares, in plain words."""

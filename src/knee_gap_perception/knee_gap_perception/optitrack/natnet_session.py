@@ -120,8 +120,12 @@ class NatNetSession:
             self.counts["packets from other machines"] += 1
             self._other_ns, self._other_address = arrival_ns, sender[0]
             return None
+        version = None if self.info is None else self.info.natnet_version
+        if version is None and data[:1] != bytes([MessageId.SERVER_INFO]):
+            self.counts["packets before the server told its version"] += 1
+            return None
         try:
-            packet = packets.decode_packet(data, None if self.info is None else self.info.natnet_version)
+            packet = packets.decode_packet(data, version)
         except PacketError as error:
             self.counts["malformed packets"] += 1
             self._fault = str(error)
