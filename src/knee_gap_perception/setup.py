@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "segmentation_node = knee_gap_perception.segmentation_node:main",
+            "tracker_precision = knee_gap_perception.tracker_precision_command:main",
             "tracking_node = knee_gap_perception.tracking_node:main",
         ],
     },
