@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.optitrack.body_source import UnknownBodyError, choose_body
+from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
+from knee_gap_perception.optitrack.scope_feed import ScopeFeed, SourceParameters
 
 MILLISECOND = 1_000_000
 
@@ -148,3 +151,47 @@ class TestRigidBodies:
         for index in range(1000):
             source.put(self.message(index, ("scope", (0.0, 0.0, 1.0))))
         assert len(source.poll()) == 64
+
+
+class TestScopeFeed:
+    def test_pose_topics_with_a_leg(self):
+        feed = ScopeFeed(SourceParameters(), reference_body="tibia")
+        for name in ("scope", "tibia"):
+            feed.source.put(name, stamped(5 * MILLISECOND))
+        ((body, others),) = feed.poll()
+        assert body.name == "scope"
+        assert [other.name for other in others] == ["tibia"]
+
+    def test_rigid_bodies_by_name_and_an_unknown_one_in_words(self):
+        message = TestRigidBodies().message(5, ("scope", (0.0, 0.2, 1.0)), ("tibia", (0.0, 0.0, 2.0)))
+        feed = ScopeFeed(SourceParameters(source="rigid_bodies", body="scope", up_axis="y"))
+        feed.source.put(message)
+        ((body, _),) = feed.poll()
+        np.testing.assert_allclose(body.position, [0.0, -1.0, 0.2])
+        assert feed.status().ok
+        wrong = ScopeFeed(SourceParameters(source="rigid_bodies", body="skope"))
+        wrong.source.put(message)
+        assert wrong.poll() == []
+        status = wrong.status()
+        assert not status.ok
+        assert "no rigid body 'skope'; it has: 'scope' (id 1), 'tibia' (id 2)" in status.words
+
+    def test_natnet_waits_for_its_server(self):
+        parameters = NatNetParameters(command_port=9)
+        feed = ScopeFeed(SourceParameters(source="natnet", body="scope"), parameters)
+        assert feed.poll(0.01) == []
+        assert "no answer from 127.0.0.1" in feed.status().words
+        feed.close()
+
+    @pytest.mark.parametrize(
+        ("source", "up_axis", "meant"),
+        [("natnet", "auto", "y"), ("pose", "auto", "z"), ("pose", "y", "y"), ("natnet", "z", "z")],
+    )
+    def test_which_axis_is_up(self, source, up_axis, meant):
+        assert SourceParameters(source=source, up_axis=up_axis).resolved_up_axis() == meant
+
+    def test_an_unknown_source_is_refused_with_those_there_are(self):
+        with pytest.raises(
+            PerceptionError, match="source must be one of pose, rigid_bodies, natnet, not 'vicon'"
+        ):
+            SourceParameters(source="vicon")

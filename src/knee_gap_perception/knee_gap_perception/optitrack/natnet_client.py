@@ -11,7 +11,6 @@ from typing import Self
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.optitrack.body_source import BodyFrame, SourceStatus
 from knee_gap_perception.optitrack.natnet_session import NatNetSession
-from knee_gap_perception.optitrack.up_axis import UP_AXES
 from knee_gap_perception.parameters import check_parameters
 
 MAX_PACKET_BYTES = 65_536
@@ -62,9 +61,6 @@ class NatNetParameters:
             "range": (1e-5, 0.1),
         },
     )
-    up_axis: str = field(
-        default="y", metadata={"description": "Axis that points up in Motive's stream", "choices": UP_AXES}
-    )
 
     def __post_init__(self) -> None:
         check_parameters(self)
@@ -73,20 +69,22 @@ class NatNetParameters:
 class NatNetClient:
     """Receives frames from Motive; a `BodySource`. Never blocks for longer than asked to.
 
-    `ros_now` gives the time of ROS [ns]; stamps follow it when it steps. Raises PerceptionError for an
-    address that is none or that this machine does not have.
+    `ros_now` gives the time of ROS [ns]; stamps follow it when it steps. `up_axis` is that of Motive's
+    stream. Raises PerceptionError for an address that is none or that this machine does not have.
     """
 
     def __init__(
-        self, parameters: NatNetParameters | None = None, ros_now: Callable[[], int] = time.time_ns
+        self,
+        parameters: NatNetParameters | None = None,
+        ros_now: Callable[[], int] = time.time_ns,
+        *,
+        up_axis: str = "y",
     ) -> None:
         self.parameters = parameters or NatNetParameters()
         self._ros_now = ros_now
         server = _resolved(self.parameters.server_address)
         self._server = (server, self.parameters.command_port)
-        self.session = NatNetSession(
-            server, up_axis=self.parameters.up_axis, max_clock_error=self.parameters.max_clock_error
-        )
+        self.session = NatNetSession(server, up_axis=up_axis, max_clock_error=self.parameters.max_clock_error)
         self._local = self.parameters.local_address or _route_to(self._server)
         self._command = _udp_socket((self._local, 0))
         self._data: socket.socket | None = None
