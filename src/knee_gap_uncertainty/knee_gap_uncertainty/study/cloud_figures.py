@@ -69,10 +69,10 @@ def draw_clouds(axes: Any, fit: Fit, scenario: Scenario, limits: Limits, title: 
         axes.plot(*plane.project(np.stack(pair)).T, color=GAP_COLOUR, lw=1.4, ls=style, zorder=4)
     ours = measured(views, scenario, fit, "paper")
     wide = measured(views, scenario, fit, "worst_case")
-    axes.set_title(title, pad=20)
+    axes.set_title(title, pad=34)
     axes.text(
         0.0, 1.015,
-        f"paper {ours.gap_min * 1e3:.2f} to {ours.gap_max * 1e3:.2f} mm,  "
+        f"paper {ours.gap_min * 1e3:.2f} to {ours.gap_max * 1e3:.2f} mm\n"
         f"worst case {wide.gap_min * 1e3:.2f} to {upper(wide.gap_max)}",
         transform=axes.transAxes, fontsize=9, color=MUTED, va="bottom",
     )  # fmt: skip

@@ -127,7 +127,7 @@ def figure_12(curves: list[Curve]) -> Any:
             draw_range(bottom, [c for c in curves if c[:3] == (name, interval, "best")])
         errors, travel = name.split(", ")
         top.set_title(f"({letter})  Errors of {errors}, travel at {travel}")
-        top.set(ylim=(0, None))
+        top.set(ylim=(0, 1.15 * max(curve.range.snr for curve in curves if curve.errors == name)))
         bottom.axhline(4, color=GAP_COLOUR, lw=1)
         bottom.annotate(
             "true gap", (7.9, 4), xytext=(0, 2), textcoords="offset points", ha="right", fontsize=8.5
@@ -230,6 +230,7 @@ def figure_runs(table: list[Row]) -> Any:
             f"ours {row_.runs.errors_mm.mean():+.3f} ± {row_.runs.errors_mm.std(ddof=1):.3f}\n"
             f"published {mean:+.4f} ± {std:.4f}",
             transform=axes.transAxes, ha="right", va="top", fontsize=8.5,
+            bbox={"facecolor": "white", "lw": 0, "pad": 2},
         )  # fmt: skip
         axes.set(yticks=[], xlim=(-3, 5))
         axes.grid(visible=False)
@@ -246,6 +247,6 @@ def figure_sensitivity(fit: Fit) -> Any:
         axes.plot(values, rms, color=INTERVAL_COLOURS["paper"], lw=1.8)
         axes.plot(getattr(fit.place, name), fit.rms_mm, "o", color=GAP_COLOUR, ms=5)
         unit = "deg" if name.endswith("deg") else "mm"
-        axes.set(xlabel=f"{name.rsplit('_', 1)[0]} [{unit}]", ylim=(0, 0.4))
+        axes.set(xlabel=f"{name.rsplit('_', 1)[0]} [{unit}]", ylim=(0, 0.3))
     grid[0, 0].set_ylabel("RMS to rows 1-5 [mm]")
     return drawn
