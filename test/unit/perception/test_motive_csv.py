@@ -262,6 +262,38 @@ class TestRefusals:
         self.check(tmp_path, "\r\n".join(rows[:7]) + "\r\n", "the take has no frames")
 
 
+def test_damaged_files_are_refused_in_one_line_or_read(tmp_path):
+    rng = np.random.default_rng(17)
+    original = Export(version="1.25", parent=True, timecode=True).text(ROWS).encode()
+    pieces = [
+        b",",
+        b"\n",
+        b'"',
+        b"\0",
+        b"nan",
+        b"1e400",
+        b";",
+        b"\xff\xfe",
+        b"9" * 30,
+        b"Rigid Body",
+        b"Frame",
+    ]
+    for _ in range(500):
+        data = bytearray(original)
+        for _ in range(int(rng.integers(1, 8))):
+            at = int(rng.integers(len(data) + 1))
+            cut = int(rng.integers(0, 40)) * int(rng.integers(2))
+            data[at : at + cut] = pieces[rng.integers(len(pieces))]
+        path = tmp_path / "damaged.csv"
+        path.write_bytes(data)
+        try:
+            take = read_take(path)
+        except TakeError as error:
+            assert "\n" not in str(error)
+        else:
+            assert (np.diff(take.time) > 0).all()
+
+
 class TestRecordedTakes:
     def test_version_1_21(self):
         take = read_take(real_take("hmv-s16_v121_quat_m_rb_rbm_marker.csv"))

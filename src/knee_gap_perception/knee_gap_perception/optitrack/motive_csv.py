@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import permutations
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,8 @@ Array = npt.NDArray[np.float64]
 METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 EULER_ORDERS = tuple("".join(order) for order in permutations("XYZ"))
 BODY_TYPE = "rigid body"
+# Length of a message: a broken file's cells may be of any length and hold line breaks.
+MOST_WORDS = 300
 LABELS = ("type", "name", "id", "parent")
 
 # Before and after noon, as the languages that Motive's machines speak write it.
@@ -135,7 +138,7 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
         needed = [0, 1, *(index for body in columns for index in body.indices)]
         cells = _cells(rows[first:], first, len(rows[first - 1]), needed, partial=partial)
     except TakeError as error:
-        raise TakeError(f"{path.name}: {error}") from None
+        raise TakeError(f"{path.name}: {shorten(str(error), MOST_WORDS)}") from None
     if not len(cells):
         raise TakeError(f"{path.name}: the take has no frames")
     time = cells[:, 1]
@@ -221,7 +224,8 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
 
 
 def _cell(row: list[str], index: int) -> str:
-    return row[index].strip() if index < len(row) else ""
+    """Text of a cell on one line, empty where there is none."""
+    return " ".join(row[index].split()) if index < len(row) else ""
 
 
 def _columns_of(name: str, identity: str, found: dict[str, int]) -> _BodyColumns:
