@@ -1,0 +1,293 @@
+"""The calibration of one scope as one YAML file, with a hash by which results can say what they rest on."""
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from scipy.spatial.transform import Rotation
+
+from knee_gap_perception.calibration.intrinsics import Intrinsics
+from knee_gap_perception.calibration.rigid import Array, rigid
+from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turned_lens
+from knee_gap_perception.errors import PerceptionError
+
+FORMAT = "knee_gap_calibration 1"
+
+
+@dataclass(frozen=True)
+class LensOnBody:
+    """The lens on the tracked body, as `hand_eye` finds it.
+
+    `covariance` (6, 6) is of the twist (rotation [rad], translation [m]) of `T_body_lens` in the lens frame;
+    all views share this error. `rotation_error` [rad] and `translation_error` [m] are RMS errors of the
+    tracked body.
+    """
+
+    translation: Array
+    quaternion_xyzw: Array
+    covariance: Array
+    mount: Mount
+    rotation_error: float
+    translation_error: float
+    left_out_rms_px: float
+    view_count: int
+
+    @property
+    def T_body_lens(self) -> Array:  # noqa: N802 - frames are in the name
+        """The lens on the body (4, 4), at the calibrated turn of the scope."""
+        return rigid(Rotation.from_quat(self.quaternion_xyzw).as_matrix(), self.translation)
+
+
+@dataclass(frozen=True)
+class Oblique:
+    """Where the notch stood at the calibrated turn [rad], the shaft's axis, and its standard deviations."""
+
+    notch_angle: float
+    axis: ShaftAxis | None
+    axis_tilt_sigma: float
+    axis_shift_sigma: float
+
+
+@dataclass(frozen=True)
+class Tip:
+    """The scope's tip on the body (3,) [m], its covariance (3, 3) [m^2] and the RMS of the pivoting [m]."""
+
+    position: Array
+    covariance: Array
+    rms: float
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What to add to an image's stamp for the tracker's clock [s], its standard error, and what found it."""
+
+    offset: float
+    sigma: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All that was calibrated of one scope, for images of one size. What was not is None."""
+
+    width_px: int
+    height_px: int
+    camera: Intrinsics | None = None
+    lens: LensOnBody | None = None
+    oblique: Oblique | None = None
+    tip: Tip | None = None
+    clock: Clock | None = None
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the content, the same wherever and whenever the file is written."""
+        text = json.dumps(_to_dict(self), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def require_image_size(self, width_px: int, height_px: int) -> None:
+        """Raise PerceptionError for images of another size than the calibration's."""
+        if (width_px, height_px) != (self.width_px, self.height_px):
+            raise PerceptionError(
+                f"the calibration was made for images of {self.width_px}x{self.height_px} px, not "
+                f"{width_px}x{height_px} px: calibrate again at this size"
+            )
+
+    def require_camera(self) -> Intrinsics:
+        """The intrinsics. Raises PerceptionError where they were not calibrated."""
+        if self.camera is None:
+            raise PerceptionError("the calibration has no camera: run calibrate intrinsics")
+        return self.camera
+
+    def require_lens(self) -> LensOnBody:
+        """The lens on the body. Raises PerceptionError where it was not calibrated."""
+        if self.lens is None:
+            raise PerceptionError("the calibration does not say where the lens is: run calibrate hand_eye")
+        return self.lens
+
+    def body_to_lens(self, scope_turn: float = 0.0) -> Array:
+        """`T_body_lens` (4, 4) at a turn [rad] of the scope in its camera head since the calibration.
+
+        Raises PerceptionError where the lens, or for a turned scope its axis, was not calibrated.
+        """
+        lens = self.require_lens()
+        return turned_lens(
+            lens.T_body_lens, scope_turn, lens.mount, self.oblique.axis if self.oblique else None
+        )
+
+    def scope_turn(self, notch_angle: float) -> float:
+        """Turn [rad], in (-pi, pi], that a notch seen at an angle [rad] says.
+
+        Raises PerceptionError where the notch was not calibrated.
+        """
+        if self.oblique is None:
+            raise PerceptionError("the calibration does not know the notch: run calibrate oblique")
+        turn = (notch_angle - self.oblique.notch_angle + np.pi) % (2 * np.pi) - np.pi
+        return float(turn)
+
+    def with_parts(self, width_px: int, height_px: int, **parts: Any) -> "Calibration":
+        """The calibration with some parts replaced. Raises PerceptionError for another image size."""
+        self.require_image_size(width_px, height_px)
+        return replace(self, **parts)
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration; the file appears whole or not at all."""
+    content = {"format": FORMAT, "hash": calibration.hash, **_to_dict(calibration)}
+    partial = path.with_name(path.name + ".part")
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 200
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            yaml.dump(content, file)
+        partial.replace(path)
+    except OSError as error:
+        raise PerceptionError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration.
+
+    Raises PerceptionError for a file that is missing, is no calibration, lacks values or was changed by hand.
+    """
+    try:
+        with path.open(encoding="utf-8") as file:
+            content = YAML(typ="safe", pure=True).load(file)
+    except OSError as error:
+        raise PerceptionError(f"the calibration {path} cannot be read: {error.strerror}") from None
+    except (YAMLError, UnicodeDecodeError):
+        raise PerceptionError(f"{path} is not YAML") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise PerceptionError(f"{path} is no calibration: its format must be '{FORMAT}'")
+    try:
+        calibration = _from_dict(content)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise PerceptionError(f"the calibration {path} is incomplete or malformed: {error!r}") from None
+    if calibration.hash != content.get("hash"):
+        raise PerceptionError(
+            f"the calibration {path} does not match its hash: it was changed by hand or damaged; calibrate "
+            "again"
+        )
+    return calibration
+
+
+def _to_dict(calibration: Calibration) -> dict[str, Any]:
+    camera, lens, oblique = calibration.camera, calibration.lens, calibration.oblique
+    tip, clock = calibration.tip, calibration.clock
+    content: dict[str, Any] = {
+        "image": {"width_px": calibration.width_px, "height_px": calibration.height_px}
+    }
+    if camera is not None:
+        content["camera"] = {
+            "distortion_model": camera.distortion_model,
+            "k": list(camera.k),
+            "d": list(camera.d),
+            "covariance": _numbers(camera.covariance),
+            "rms_px": camera.rms_px,
+            "sigma_px": camera.sigma_px,
+            "design_effect": camera.design_effect,
+            "view_count": camera.view_count,
+            "point_count": camera.point_count,
+        }
+    if lens is not None:
+        content["lens"] = {
+            "mount": str(lens.mount),
+            "translation": _numbers(lens.translation),
+            "quaternion_xyzw": _numbers(lens.quaternion_xyzw),
+            "covariance": _numbers(lens.covariance),
+            "rotation_error": lens.rotation_error,
+            "translation_error": lens.translation_error,
+            "left_out_rms_px": lens.left_out_rms_px,
+            "view_count": lens.view_count,
+        }
+    if oblique is not None:
+        content["oblique"] = {
+            "notch_angle": oblique.notch_angle,
+            "axis_direction": _numbers(oblique.axis.direction) if oblique.axis else None,
+            "axis_point": _numbers(oblique.axis.point) if oblique.axis else None,
+            "axis_tilt_sigma": oblique.axis_tilt_sigma,
+            "axis_shift_sigma": oblique.axis_shift_sigma,
+        }
+    if tip is not None:
+        content["tip"] = {
+            "position": _numbers(tip.position),
+            "covariance": _numbers(tip.covariance),
+            "rms": tip.rms,
+        }
+    if clock is not None:
+        content["clock"] = {"time_offset": clock.offset, "sigma": clock.sigma, "source": clock.source}
+    return content
+
+
+def _from_dict(content: dict[str, Any]) -> Calibration:
+    image = content["image"]
+    width, height = int(image["width_px"]), int(image["height_px"])
+    return Calibration(
+        width,
+        height,
+        _camera(content["camera"], width, height) if "camera" in content else None,
+        _lens(content["lens"]) if "lens" in content else None,
+        _oblique(content["oblique"]) if "oblique" in content else None,
+        _tip(content["tip"]) if "tip" in content else None,
+        _clock(content["clock"]) if "clock" in content else None,
+    )
+
+
+def _camera(values: dict[str, Any], width: int, height: int) -> Intrinsics:
+    k, d = (tuple(float(value) for value in values[name]) for name in ("k", "d"))
+    size = 4 + len(d)
+    return Intrinsics(
+        width=width,
+        height=height,
+        distortion_model=str(values["distortion_model"]),
+        k=k,
+        d=d,
+        covariance=_array(values["covariance"], size, size),
+        rms_px=float(values["rms_px"]),
+        sigma_px=float(values["sigma_px"]),
+        design_effect=float(values["design_effect"]),
+        view_count=int(values["view_count"]),
+        point_count=int(values["point_count"]),
+    )
+
+
+def _lens(values: dict[str, Any]) -> LensOnBody:
+    return LensOnBody(
+        translation=_array(values["translation"], 3),
+        quaternion_xyzw=_array(values["quaternion_xyzw"], 4),
+        covariance=_array(values["covariance"], 6, 6),
+        mount=Mount(values["mount"]),
+        rotation_error=float(values["rotation_error"]),
+        translation_error=float(values["translation_error"]),
+        left_out_rms_px=float(values["left_out_rms_px"]),
+        view_count=int(values["view_count"]),
+    )
+
+
+def _oblique(values: dict[str, Any]) -> Oblique:
+    axis = None
+    if values["axis_direction"] is not None:
+        axis = ShaftAxis(_array(values["axis_direction"], 3), _array(values["axis_point"], 3))
+    sigmas = float(values["axis_tilt_sigma"]), float(values["axis_shift_sigma"])
+    return Oblique(float(values["notch_angle"]), axis, *sigmas)
+
+
+def _tip(values: dict[str, Any]) -> Tip:
+    return Tip(_array(values["position"], 3), _array(values["covariance"], 3, 3), float(values["rms"]))
+
+
+def _clock(values: dict[str, Any]) -> Clock:
+    return Clock(float(values["time_offset"]), float(values["sigma"]), str(values["source"]))
+
+
+def _numbers(array: Array) -> list[float]:
+    return [float(value) for value in np.ravel(array)]
+
+
+def _array(values: Any, *shape: int) -> Array:
+    return np.array([float(value) for value in values]).reshape(shape)

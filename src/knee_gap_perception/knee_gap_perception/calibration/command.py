@@ -1,0 +1,145 @@
+"""`calibrate`: a scope's calibration from recorded bags into one file, step by step or all at once."""
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from rosbags.serde import SerdeError
+from tqdm import tqdm
+
+from knee_gap_perception.calibration.boards import BOARD_SYNTAX, board_from_text
+from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration, save_calibration
+from knee_gap_perception.calibration.lens_model import NAMES, LensModel
+from knee_gap_perception.calibration.procedure import Procedure, Request
+from knee_gap_perception.calibration.scope_turn import Mount
+from knee_gap_perception.errors import PerceptionError
+
+STEPS = {
+    "intrinsics": "focal lengths, principal point and distortion, from a board",
+    "time_offset": "time between video and tracker, from any textured scene",
+    "hand_eye": "the lens on the tracked body, from a board that stands still",
+    "oblique": "hand_eye, and the axis about which an oblique scope turns in its camera head, from its notch",
+    "pivot": "the scope's tip on the tracked body, from pivoting about it",
+    "all": "every step that the bag has data for",
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="calibrate", description=__doc__)
+    steps = parser.add_subparsers(dest="step", required=True, metavar="STEP")
+    defaults = Request(Path())
+    for name, text in STEPS.items():
+        step = steps.add_parser(name, help=text, description=text)
+        step.add_argument("bag", type=Path, help="recorded bag")
+        step.add_argument(
+            "--into", type=Path, required=True, metavar="FILE", help="calibration to make or add to"
+        )
+        step.add_argument("--board", metavar="BOARD", help=BOARD_SYNTAX)
+        step.add_argument("--image-topic", default=defaults.image_topic)
+        step.add_argument("--pose-topic", default=defaults.pose_topic)
+        step.add_argument("--model", choices=list(NAMES), default=defaults.model.distortion_model)
+        step.add_argument("--high-order", action="store_true", help="fit the high distortion terms too")
+        step.add_argument("--mount", choices=[str(m) for m in Mount], default=str(defaults.mount))
+        step.add_argument("--views", type=int, default=defaults.views, help="images to look for the board in")
+        step.add_argument("--fixed-intrinsics", action="store_true", help="keep the camera as it is in FILE")
+        step.add_argument("--time-offset", type=float, metavar="S", help="to start from, instead of FILE's")
+        step.add_argument("--max-offset", type=float, default=defaults.max_offset, metavar="S")
+        step.add_argument(
+            "--begin", type=float, default=0.0, metavar="S", help="part of the bag, from its start"
+        )
+        step.add_argument("--end", type=float, default=float("inf"), metavar="S")
+    show = steps.add_parser("show", help="what a calibration says, and its hash")
+    show.add_argument("file", type=Path)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Calibrate; 0 when it is done."""
+    arguments = _parser().parse_args(argv)
+    try:
+        if arguments.step == "show":
+            _show(load_calibration(arguments.file))
+        else:
+            _calibrate(arguments)
+    except (PerceptionError, SerdeError) as error:
+        print(f"calibrate {arguments.step}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    request = Request(
+        bag=arguments.bag,
+        board=board_from_text(arguments.board) if arguments.board else None,
+        image_topic=arguments.image_topic,
+        pose_topic=arguments.pose_topic,
+        model=LensModel(arguments.model, arguments.high_order),
+        mount=Mount(arguments.mount),
+        views=arguments.views,
+        free_intrinsics=not arguments.fixed_intrinsics,
+        time_offset=arguments.time_offset,
+        max_offset=arguments.max_offset,
+        begin=arguments.begin,
+        end=arguments.end,
+    )
+    procedure = Procedure(request, lambda line: print(f"  {line}", flush=True), _progress)
+    calibration = load_calibration(arguments.into) if arguments.into.exists() else None
+    for step in _chosen(arguments.step, procedure):
+        print(step, flush=True)
+        calibration = getattr(procedure, step)(calibration)
+    if calibration is not None:
+        save_calibration(calibration, arguments.into)
+        print(f"{arguments.into}: hash {calibration.hash[:12]}")
+
+
+def _chosen(step: str, procedure: Procedure) -> list[str]:
+    """The steps to take: one, or all that the bag marks; in an unmarked bag, those of a board."""
+    if step != "all":
+        return [step]
+    marked = procedure.steps
+    lens = "oblique" if "oblique" in marked else "hand_eye"
+    return ["time_offset", "intrinsics", lens, *(["pivot"] if "pivot" in marked else [])]
+
+
+def _progress(items: Iterable[int], text: str) -> Iterable[int]:
+    """A bar on a terminal; a line at each quarter elsewhere."""
+    known = list(items)
+    if sys.stderr.isatty():
+        yield from tqdm(known, desc=text, unit="image", leave=False)
+        return
+    marks = {len(known) * quarter // 4: 25 * quarter for quarter in range(4)}
+    for index, item in enumerate(known):
+        if index in marks:
+            print(f"  {text}: {marks[index]} % of {len(known)} images", file=sys.stderr, flush=True)
+        yield item
+
+
+def _show(calibration: Calibration) -> None:
+    print(f"hash {calibration.hash}")
+    print(f"images {calibration.width_px}x{calibration.height_px} px")
+    if (camera := calibration.camera) is not None:
+        print(
+            f"camera {camera.distortion_model}, f {camera.k[0]:.2f} {camera.k[4]:.2f} px, centre "
+            f"{camera.k[2]:.2f} "
+            f"{camera.k[5]:.2f} px, {camera.rms_px:.3f} px RMS"
+        )
+    if (lens := calibration.lens) is not None:
+        position = " ".join(f"{1e3 * value:.3f}" for value in lens.T_body_lens[:3, 3])
+        sigma = np.sqrt(np.trace(lens.covariance[3:, 3:])), np.sqrt(np.trace(lens.covariance[:3, :3]))
+        print(
+            f"lens at {position} mm on the {lens.mount}'s body, ± {1e3 * sigma[0]:.3f} mm, ± "
+            f"{np.degrees(sigma[1]):.3f} deg"
+        )
+    if (oblique := calibration.oblique) is not None:
+        turning = "may be turned" if oblique.axis is not None else "must not be turned"
+        print(f"notch at {np.degrees(oblique.notch_angle):.2f} deg; the scope {turning} in its camera head")
+    if (tip := calibration.tip) is not None:
+        print("tip at " + " ".join(f"{1e3 * value:.3f}" for value in tip.position) + " mm on the body")
+    if (clock := calibration.clock) is not None:
+        print(f"time offset {1e3 * clock.offset:+.3f} ± {1e3 * clock.sigma:.3f} ms ({clock.source})")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
