@@ -2,9 +2,13 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from knee_gap_perception.poses import BodyPose
 
 MUCH_NEARER = 4.0
+# Two bodies are never this close [m], so a label that moved less has not been swapped.
+SEPARATION = 0.005
 
 Reach = Callable[[BodyPose, BodyPose], float]
 
@@ -38,6 +42,8 @@ class SwappedBodies:
 
     def _exchanged(self, seen: dict[str, BodyPose], first: str, second: str, reach: Reach) -> bool:
         if first not in self._last:
+            return False
+        if np.abs(seen[first].position - self._last[first].position).max() < SEPARATION:
             return False
         own, foreign = reach(self._last[first], seen[first]), reach(self._last[second], seen[first])
         if second not in seen:

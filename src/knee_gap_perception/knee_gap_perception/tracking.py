@@ -116,7 +116,9 @@ class ScopeTracker:
         self.validity = PoseValidity(validity)
         self.reference_validity = PoseValidity(validity)
         self.accepted_count = 0
-        self._T_body_lens = self.parameters.body_to_lens()
+        T_body_lens = self.parameters.body_to_lens()
+        self._R_body_lens = Rotation.from_matrix(T_body_lens[:3, :3])
+        self._lever = T_body_lens[:3, 3]
 
     def update(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> LensPose | Refusal:
         """Return the pose of the lens at the stamp of `body`, or why there is none.
@@ -158,8 +160,8 @@ class ScopeTracker:
     def _lens_pose(self, body: BodyPose) -> LensPose:
         parameters = self.parameters
         R_world_body = Rotation.from_quat(body.quaternion_xyzw)
-        lever = R_world_body.apply(self._T_body_lens[:3, 3])
-        quaternion = (R_world_body * Rotation.from_matrix(self._T_body_lens[:3, :3])).as_quat(canonical=True)
+        lever = R_world_body.apply(self._lever)
+        quaternion = (R_world_body * self._R_body_lens).as_quat(canonical=True)
         return LensPose(
             stamp_ns=body.stamp_ns,
             frame_id=parameters.frame_id,
