@@ -201,7 +201,7 @@ class GapEdgeDetector:
         self._tracks += 1
         self._clicked = None
         self._seen_ns = stamp_ns
-        self._track = _Track(self._tracks, (first, second), (EdgeKind.UNKNOWN, EdgeKind.UNKNOWN))
+        self._track = _Track(self._tracks, (first, second), (points[0].kind, points[1].kind))
         return [first.first, second.first]
 
     def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_perception.edge_kind import edge_kind
+from knee_gap_perception.edges import EdgeKind
 from knee_gap_perception.field_of_view import FieldOfView
 from knee_gap_perception.patch_registration import Patch, surface_around
 from knee_gap_perception.section import Section
@@ -22,14 +24,18 @@ DARK_SHARE = 0.35  # of the way from gap to tissue, below which a pixel is the g
 
 @dataclass(frozen=True)
 class SurfacePoint:
-    """A point on the tissue: pixel (2,), grey level below which is the gap, and the strength of its texture.
+    """A point on the tissue beside the gap.
 
-    The strength is the information on a shift in the weaker direction [1/px^2].
+    `pixel` (2,); `dark_below`, the grey level below which is the gap; `texture`, the information on a shift
+    in the weaker direction [1/px^2]; `kind` of the edge; `outward`, the unit vector (2,) from the gap onto
+    the tissue.
     """
 
     pixel: Array
     dark_below: float
     texture: float
+    kind: EdgeKind
+    outward: Array
 
 
 def choose_points(
@@ -37,8 +43,8 @@ def choose_points(
 ) -> list[SurfacePoint] | None:
     """The two points beside a section's edges, `inset_px` inside the tissue; None where a side has none.
 
-    Near the section, and a little nearer to or farther from the edge, the place with the strongest texture and
-    without highlight is taken: the texture is what the point is followed by.
+    Near the section, and a little nearer to or farther from the edge, the place with the strongest texture
+    and without highlight is taken: the texture is what the point is followed by.
     """
     gap = _level(grey, section.centre)
     chosen = []
@@ -48,15 +54,13 @@ def choose_points(
         tissue = _level(grey, section.edges[index] + (EDGE_SEARCH + inset_px) * outward)
         if tissue <= gap:
             return None
-        candidates = [
-            _judge(grey, edge + share * inset_px * outward, gap + DARK_SHARE * (tissue - gap), shift)
-            for shift in ALONG
-            if (
-                edge := _edge_on_line(grey, section.edges[index] + shift * along, outward, (gap + tissue) / 2)
-            )
-            is not None
-            for share in INSETS
-        ]
+        dark_below = gap + DARK_SHARE * (tissue - gap)
+        candidates = []
+        for shift in ALONG:
+            edge = _edge_on_line(grey, section.edges[index] + shift * along, outward, (gap + tissue) / 2)
+            if edge is not None:
+                places = [edge + share * inset_px * outward for share in INSETS]
+                candidates += [_judge(grey, place, dark_below, shift, edge, outward) for place in places]
         usable = [point for point in candidates if field.depth_inside(point.pixel) > 2 * PATCH_HALF]
         best = max(usable, key=lambda point: point.texture, default=None)
         if best is None or best.texture <= 0:
@@ -86,11 +90,13 @@ def _edge_on_line(grey: Image, start: Array, outward: Array, threshold: float) -
     return np.asarray(start + steps[dark[-1] + 1] * outward)
 
 
-def _judge(grey: Image, pixel: Array, dark_below: float, shift: float) -> SurfacePoint:
+def _judge(
+    grey: Image, pixel: Array, dark_below: float, shift: float, edge: Array, outward: Array
+) -> SurfacePoint:
     surface = surface_around(grey, pixel, PATCH_HALF + 10, dark_below)
     patch = Patch(surface, pixel, PATCH_HALF)
-    if patch.coverage < MINIMUM_TISSUE:
-        return SurfacePoint(pixel, dark_below, 0.0)
-    weaker = float(np.linalg.eigvalsh(patch.information())[0])
-    # Away from the section the distance of the points is no longer that of the edges.
-    return SurfacePoint(pixel, dark_below, weaker * (1.0 - (shift / 120.0) ** 2))
+    texture = 0.0
+    if patch.coverage >= MINIMUM_TISSUE:
+        # Away from the section the distance of the points is no longer that of the edges.
+        texture = float(np.linalg.eigvalsh(patch.information())[0]) * (1.0 - (shift / 120.0) ** 2)
+    return SurfacePoint(pixel, dark_below, texture, edge_kind(grey, edge, outward), outward)

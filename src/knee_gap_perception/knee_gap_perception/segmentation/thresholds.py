@@ -39,14 +39,27 @@ class Otsu:
 
 
 class Otsu3:
-    """Three classes on the brightest channel: gap, shaded tissue, lit tissue. Only the darkest is the gap."""
+    """Three classes on the logarithm of the darker of green and blue: only the darkest is the gap.
+
+    The three are gap, shaded tissue and lit tissue. Light falls with the square of the distance and with
+    the cosine of incidence, so classes are even in its logarithm: on the simulated knee the shaded flank of
+    a condyle is lost to the gap otherwise (Dice 0.95 on the brightest channel, 0.98-0.99 here). Green and
+    blue are dark in the gap even where the far wall of the joint glows red.
+    """
+
+    OFFSET = 16.0  # [grey levels] noise of a black gap makes no class of its own
 
     def __call__(self, image: Image, field: Mask) -> Mask:
         """Dark pixels (h, w) of an image (h, w, 3) within `field` (h, w)."""
-        value = brightness(image)
         if not field.any():
             return field.copy()
-        return np.asarray(field & (value <= otsu3_threshold(value[field])))
+        value = cv2.LUT(np.asarray(cv2.min(image[..., 0], image[..., 1])), self._curve())
+        return np.asarray(field & (value <= otsu3_threshold(np.asarray(value[field], np.uint8))))
+
+    def _curve(self) -> npt.NDArray[np.uint8]:
+        """The logarithm of a grey level as a grey level."""
+        levels = np.log((np.arange(256) + self.OFFSET) / self.OFFSET)
+        return np.asarray(np.rint(255 * levels / levels[-1]), dtype=np.uint8)
 
 
 class Adaptive:
