@@ -166,11 +166,13 @@ class NatNetClient:
         return min(readings)[1]
 
     def _follow_transmission(self) -> None:
-        """Listen to the multicast group that the server tells, if it sends that way."""
+        """Listen to the multicast group that the server tells, if it sends that way or does not say how."""
         info = self.session.info
         if self.parameters.transmission != "auto" or info is None:
             return
-        if info.multicast and info.multicast_address and info.data_port:
+        if info.multicast is None:
+            self._join((self.parameters.multicast_address, self.parameters.data_port))
+        elif info.multicast and info.multicast_address and info.data_port:
             self._join((info.multicast_address, info.data_port))
 
     def _join(self, group: tuple[str, int]) -> None:
