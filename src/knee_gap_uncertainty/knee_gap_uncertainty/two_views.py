@@ -54,9 +54,13 @@ def two_views(
 
 
 def finite(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
-    """The value as an array of that shape; BadInputError names what is wrong with it."""
+    """The value as an array of that shape; BadInputError names what is wrong with it.
+
+    Always a copy in C order: kernels are compiled for that, and would be again, in flight, for a view or a
+    read-only array.
+    """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):
         raise BadInputError(f"{name} must be numbers of shape {shape}, got {value!r}") from None
     if array.shape != shape:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.gap_range import cloud_range, gap_range, warm_up
 
 PSI = math.radians(2.364)
 DT = 0.0367e-3
@@ -238,3 +238,25 @@ def test_one_kind_of_error_alone(absent):
     both = gap_range(*view, **error)
     one = gap_range(*view, **error | {absent: 0.0})
     assert both.gap_min < one.gap_min < one.gap < one.gap_max < both.gap_max
+
+
+def test_after_the_warm_up_nothing_is_compiled_any_more():
+    """Not for views, read-only arrays or lists, other intervals, apexes or radii: an image must not wait."""
+    warm_up()
+    compiled = len(cloud_range.signatures)
+    lens_0, lens_1, bearings_0, bearings_1, _ = scene(np.random.default_rng(14))
+    bearings_0.setflags(write=False)
+    for interval, apex, radii in product(("paper", "worst_case"), ("first", "second", "best"), (1, 2)):
+        gap_range(
+            list(lens_0), lens_1, bearings_0[::-1], bearings_1.T.copy().T[::-1],
+            angular_error=0.01, translation_error=1e-5, interval=interval, apex=apex, radii=radii,
+        )  # fmt: skip
+    assert len(cloud_range.signatures) == compiled == 1
+
+
+def test_inputs_are_left_as_they_were():
+    view = scene(np.random.default_rng(15))[:4]
+    before = [array.copy() for array in view]
+    gap_range(*view, angular_error=0.01, translation_error=1e-5, apex="best")
+    for array, copy in zip(view, before, strict=True):
+        np.testing.assert_array_equal(array, copy)

@@ -54,6 +54,8 @@ def save(drawn: Any, path: Path) -> Path:
     """Write PNG and SVG beside each other and close the figure; returns the PNG's path."""
     image = path.with_suffix(".png")
     drawn.savefig(image, facecolor="white")
+    # The places found for the first file serve for the second: laying out again is most of the work.
+    drawn.set_layout_engine("none")
     drawn.savefig(path.with_suffix(".svg"), facecolor="white", metadata={"Date": None})
     plt.close(drawn)
     return image
