@@ -22,6 +22,7 @@ from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import NANOSECONDS, GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
+from knee_gap_uncertainty.motion_advice import AdviceParameters
 
 _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 
@@ -30,7 +31,7 @@ _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 PARAMETERS: dict[str, tuple[type, ...]] = {
     "segmentation_node": (EdgeParameters,),
     "tracking_node": (TrackingParameters, ValidityParameters),
-    "uncertainty_node": (EstimatorParameters,),
+    "uncertainty_node": (EstimatorParameters, AdviceParameters),
 }
 
 
@@ -75,6 +76,7 @@ class GapPipeline:
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
             self._topic("gap"): ("knee_gap_msgs/msg/GapEstimate", "reliable"),
+            self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
             **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
         }
 
@@ -84,6 +86,7 @@ class GapPipeline:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
         self._newest_stamp_ns = stamp_ns
         yield from self._published(self._estimator.advance(self._now_ns))
+        yield from self._advice()
         if topic == self._topics.camera_info:
             self._detector.on_camera_info(message)
         elif topic == self._topics.body_pose:
@@ -121,6 +124,13 @@ class GapPipeline:
                     number = blank("std_msgs/msg/Float64")
                     number.data = float(getattr(estimate, attribute))
                     yield Output(self._topic(name), number, estimate.stamp_ns)
+
+    def _advice(self) -> Iterator[Output]:
+        while self._estimator.advice:
+            advice = self._estimator.advice.popleft()
+            message = blank("knee_gap_msgs/msg/MotionAdvice")
+            messages.fill_motion_advice(message, advice, self._estimator.advice_parameters)
+            yield Output(self._topic("motion_advice"), message, advice.stamp_ns)
 
     def _topic(self, name: str) -> str:
         return f"{self._space}/{name}"

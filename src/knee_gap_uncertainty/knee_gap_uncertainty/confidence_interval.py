@@ -12,17 +12,20 @@ import numpy.typing as npt
 from scipy.stats import norm
 
 from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.curved_test import radius_at
+from knee_gap_uncertainty.distance_extremes import largest_distance, smallest_distance
 from knee_gap_uncertainty.errors import BadInputError
 from knee_gap_uncertainty.multi_view import MultiViewFit
-from knee_gap_uncertainty.small_matrix import cholesky, solve_factored
+from knee_gap_uncertainty.small_matrix import cholesky
 
 Array = npt.NDArray[np.float64]
 
 # Relative standard deviation of inverse depth beyond which no interval is given.
 LARGEST_INVERSE_DEPTH_VARIATION = 0.15
 
-ASCENT_STEPS = 60
-DESCENT_STEPS = 30
+# Turns in which the radius and the place it is for are brought together.
+RADIUS_TURNS = 12
+RADIUS_TOLERANCE = 5e-3
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
     """
     if not 0.0 < level < 1.0:
         raise BadInputError(f"the confidence level must lie inside (0, 1), not {level!r}")
-    lower, upper = distance_extremes(
+    lower, upper = interval_ends(
         fit.frames, fit.unknowns, fit.unknowns_covariance, float(norm.ppf(0.5 + 0.5 * level))
     )
     variation = fit.inverse_depth_variation
@@ -62,181 +65,66 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
 
 
 @compiled
-def distance_extremes(
-    frames: Array, unknowns: Array, covariance: Array, radius: float
-) -> tuple[float, float]:
-    """Smallest and largest distance [m] of the points over an ellipsoid of `radius` standard deviations.
+def interval_ends(frames: Array, unknowns: Array, covariance: Array, radius: float) -> tuple[float, float]:
+    """Lower and upper end [m] at the level whose two-sided normal deviate is `radius`.
 
-    `unknowns` (2, 3) and `covariance` (6, 6) as in MultiViewFit. The largest is infinite where the ellipsoid
+    `unknowns` (2, 3) and `covariance` (6, 6) as in MultiViewFit. The upper end is infinite where the ellipsoid
     reaches an inverse depth of 0.
     """
-    factor = np.zeros((6, 6))
-    if not cholesky(covariance, factor):
+    root = np.zeros((6, 6))
+    if not cholesky(covariance, root):
         return 0.0, np.inf
-    for row in range(6):
-        for column in range(6):
-            factor[row, column] *= radius
-    lower = _smallest_distance(frames, unknowns, factor)
-    for n in range(2):
-        k = 3 * n + 2
-        if unknowns[n, 2] - radius * np.sqrt(covariance[k, k]) <= 0.0:
-            return lower, np.inf
-    return lower, max(_largest_distance(frames, unknowns, factor), lower)
-
-
-@compiled
-def _difference(
-    frames: Array, unknowns: Array, factor: Array, unit: Array, apart: Array, slope: Array
-) -> bool:
-    """Write G_1 - G_0 at unknowns + factor @ unit, and its (3, 6) slope by `unit`; false at infinity."""
-    apart[:] = 0.0
-    slope[:, :] = 0.0
-    place = np.zeros(3)
-    for n in range(2):
-        sign = 2.0 * n - 1.0
-        for k in range(3):
-            place[k] = unknowns[n, k]
-            for column in range(3 * n + k + 1):
-                place[k] += factor[3 * n + k, column] * unit[column]
-        rho = place[2]
-        if not rho > 1e-6:
-            return False
-        for k in range(3):
-            direction = frames[n, 0, k] + place[0] * frames[n, 1, k] + place[1] * frames[n, 2, k]
-            apart[k] += sign * direction / rho
-            for column in range(3 * n + 3):
-                change = (
-                    frames[n, 1, k] * factor[3 * n, column]
-                    + frames[n, 2, k] * factor[3 * n + 1, column]
-                    - direction / rho * factor[3 * n + 2, column]
-                )
-                slope[k, column] += sign * change / rho
-    return True
-
-
-@compiled
-def _largest_distance(frames: Array, unknowns: Array, factor: Array) -> float:
-    """Fixed-point ascent of the distance over the ellipsoid's surface.
-
-    It starts along the present difference and, because a gap of the size of its error can grow to either
-    side, along both senses of each axis of space.
-    """
     unit = np.zeros(6)
     apart = np.zeros(3)
     slope = np.zeros((3, 6))
-    towards = np.zeros((7, 3))
-    best = 0.0
-    if not _difference(frames, unknowns, factor, unit, apart, slope):
-        return np.inf
-    towards[0] = apart
-    for axis in range(3):
-        for k in range(3):
-            towards[1 + 2 * axis, k] = frames[0, axis, k]
-            towards[2 + 2 * axis, k] = -frames[0, axis, k]
-    slope_at_centre = slope.copy()
-    for first in range(7):
-        aim = towards[first].copy()
-        slope[:, :] = slope_at_centre
-        previous = 0.0
-        for _ in range(ASCENT_STEPS):
-            length = 0.0
-            for column in range(6):
-                value = 0.0
-                for k in range(3):
-                    value += slope[k, column] * aim[k]
-                unit[column] = value
-                length += value * value
-            length = np.sqrt(length)
-            if not length > 0.0:
-                break
-            for column in range(6):
-                unit[column] /= length
-            if not _difference(frames, unknowns, factor, unit, apart, slope):
-                return np.inf
-            distance = np.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
-            best = max(best, distance)
-            if abs(distance - previous) <= 1e-9 * distance:
-                break
-            previous = distance
-            aim[:] = apart
-    return best
-
-
-@compiled
-def _smallest_distance(frames: Array, unknowns: Array, factor: Array) -> float:
-    """Gauss-Newton of the difference to zero, each step the best one inside the ellipsoid."""
-    unit = np.zeros(6)
-    trial = np.zeros(6)
-    apart = np.zeros(3)
-    slope = np.zeros((3, 6))
-    if not _difference(frames, unknowns, factor, unit, apart, slope):
-        return 0.0
-    best = np.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
-    target = np.zeros(3)
-    share = 1.0
-    for _ in range(DESCENT_STEPS):
-        for k in range(3):
-            target[k] = -apart[k]
-            for column in range(6):
-                target[k] += slope[k, column] * unit[column]
-        _nearest_inside(slope, target, trial)
-        share = 1.0
-        improved = False
-        for _ in range(6):
-            for column in range(6):
-                trial[column] = unit[column] + share * (trial[column] - unit[column])
-            inside = _difference(frames, unknowns, factor, trial, apart, slope)
-            distance = np.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
-            if inside and distance < best:
-                improved = True
-                break
-            share = 0.5
-        if not improved or best - distance <= 1e-9 * best:
-            best = min(best, distance) if improved else best
+    lower = 0.0
+    used = radius
+    for _ in range(RADIUS_TURNS):
+        lower = smallest_distance(frames, unknowns, used * root, unit, apart, slope)
+        if not lower > 0.0:
             break
-        best = distance
-        unit[:] = trial
-    return float(best)
+        changed = _radius_there(unknowns, root, used, unit, apart, slope, radius)
+        if abs(changed - used) < RADIUS_TOLERANCE:
+            break
+        used = changed
+    used = radius
+    for _ in range(RADIUS_TURNS):
+        upper = largest_distance(frames, unknowns, used * root, unit, apart, slope)
+        if not upper < np.inf:
+            return lower, np.inf
+        changed = _radius_there(unknowns, root, used, unit, apart, slope, radius)
+        if abs(changed - used) < RADIUS_TOLERANCE:
+            return lower, max(upper, lower)
+        used = changed
+    # Every wider interval asks for a wider one still: the data do not bound the gap.
+    return lower, np.inf
 
 
 @compiled
-def _nearest_inside(slope: Array, target: Array, unit: Array) -> None:
-    """Write the `unit` of length at most 1 whose slope @ unit is nearest to the target (secular equation)."""
-    gram = np.zeros((3, 3))
-    damped = np.zeros((3, 3))
-    factor = np.zeros((3, 3))
-    weights = np.zeros(3)
-    again = np.zeros(3)
+def _radius_there(
+    unknowns: Array, root: Array, used: float, unit: Array, apart: Array, slope: Array, radius: float
+) -> float:
+    """Radius for the place that an ellipsoid of the radius `used` touches."""
+    spread = np.zeros((3, 3))
     for row in range(3):
         for column in range(3):
             for k in range(6):
-                gram[row, column] += slope[row, k] * slope[column, k]
-    trace = gram[0, 0] + gram[1, 1] + gram[2, 2]
-    damping = 1e-12 * trace
-    for _ in range(40):
-        damped[:, :] = gram
-        for k in range(3):
-            damped[k, k] += damping
-        if not cholesky(damped, factor):
-            damping = max(10.0 * damping, 1e-9 * trace)
-            continue
-        solve_factored(factor, target, weights)
-        squared = 0.0
-        for column in range(6):
-            value = 0.0
-            for k in range(3):
-                value += slope[k, column] * weights[k]
-            unit[column] = value
-            squared += value * value
-        length = np.sqrt(squared)
-        if length <= 1.0 + 1e-10:
-            return
-        # Newton's step on 1 / |unit| - 1, whose graph over the damping is nearly straight.
-        solve_factored(factor, weights, again)
-        inner = 0.0
-        for row in range(3):
-            for column in range(3):
-                inner += weights[row] * gram[row, column] * again[column]
-        damping += (length - 1.0) * squared / max(inner, 1e-300)
+                spread[row, column] += slope[row, k] * slope[column, k] / (used * used)
+    normal = np.zeros(6)
+    length = 0.0
     for column in range(6):
-        unit[column] /= max(length, 1.0)
+        for k in range(3):
+            normal[column] += slope[k, column] * apart[k]
+        length += normal[column] ** 2
+    margins = np.zeros(2)
+    slopes = np.zeros(2)
+    for n in range(2):
+        there, variance = unknowns[n, 2], 0.0
+        for k in range(6):
+            element = root[3 * n + 2, k]
+            there += used * element * unit[k]
+            variance += element * element
+            slopes[n] += element * normal[k] / np.sqrt(max(length, 1e-300))
+        margins[n] = there / np.sqrt(variance) - 1.0 / LARGEST_INVERSE_DEPTH_VARIATION
+        slopes[n] /= np.sqrt(variance)
+    return radius_at(apart, spread, margins, slopes, radius)

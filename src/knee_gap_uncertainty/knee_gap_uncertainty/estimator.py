@@ -6,10 +6,13 @@ calls `advance` when time passes without one.
 """
 
 from collections import Counter, deque
+from dataclasses import replace
 from typing import NamedTuple
 
+from knee_gap_uncertainty.advice_task import AdviceTask
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.track import Track
 
@@ -17,6 +20,10 @@ NANOSECONDS = 1_000_000_000
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
+
+
+# Advice that nobody has taken yet.
+MOST_ADVICE = 16
 
 
 class Pending(NamedTuple):
@@ -27,10 +34,17 @@ class Pending(NamedTuple):
 
 
 class GapEstimator:
-    """Fuses edges and lens poses into one estimate an image, in the order of the images."""
+    """Fuses edges and lens poses into one estimate an image, in the order of the images.
 
-    def __init__(self, parameters: EstimatorParameters | None = None) -> None:
+    Advice on motion is made while time passes; whoever wants it takes it from `advice`.
+    """
+
+    def __init__(
+        self, parameters: EstimatorParameters | None = None, advice: AdviceParameters | None = None
+    ) -> None:
         self.parameters = parameters or EstimatorParameters()
+        self.advice: deque[MotionAdvice] = deque(maxlen=MOST_ADVICE)
+        self._advice_task = AdviceTask(advice)
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
@@ -40,6 +54,11 @@ class GapEstimator:
         self._last_edges: Pending | None = None
         self._silence_told_ns = 0
         self._now_ns = 0
+
+    @property
+    def advice_parameters(self) -> AdviceParameters:
+        """What the advice aims at."""
+        return self._advice_task.parameters
 
     def add_pose(self, pose: LensPose, arrival_ns: int) -> list[GapEstimate]:
         """Take a lens pose; return the estimates that it made possible."""
@@ -69,6 +88,8 @@ class GapEstimator:
     def advance(self, now_ns: int) -> list[GapEstimate]:
         """Let time pass; return the estimates that must not wait any longer, and what silence means."""
         self._turn_clock(now_ns)
+        if advice := self._advice_task.turn(self._situation()):
+            self.advice.append(advice)
         estimates = self._resolve(now_ns)
         if self._last_edges is None or self._pending:
             return estimates
@@ -122,7 +143,13 @@ class GapEstimator:
         """Estimate from the edges and their lens pose, within the track that they belong to."""
         if self._track is None or not self._track.continues_with(edges, pose):
             self._track = Track(edges.track_id, pose.frame_id, self.parameters)
-        return self._count(self._track.add(edges, pose))
+        estimate = self._track.add(edges, pose)
+        travel_left = self._advice_task.travel_left(self._track.situation)
+        return self._count(replace(estimate, translation_to_target=travel_left))
+
+    def _situation(self) -> Situation | None:
+        """What advice can be based on now."""
+        return self._track.situation if self._track is not None else None
 
     def _without(self, stamp_ns: int, status: GapStatus, track_id: int, reason: str) -> GapEstimate:
         """An estimate that says why there is no number."""

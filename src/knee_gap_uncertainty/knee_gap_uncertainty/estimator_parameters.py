@@ -46,13 +46,6 @@ class EstimatorParameters:
             "range": (0.0, 1.0),
         },
     )
-    target_snr: float = field(
-        default=4.0,
-        metadata={
-            "description": "signal-to-noise ratio that translation_to_target asks for [-]",
-            "range": (0.1, 1000.0),
-        },
-    )
     max_pose_age: float = field(
         default=0.025,
         metadata={
@@ -77,7 +70,7 @@ class EstimatorParameters:
 
     def __post_init__(self) -> None:
         """Refuse what no ROS range can: a combination or a value given in code."""
-        for name in ("tracker_bound", "target_snr", "max_pose_age", "max_edges_silence"):
+        for name in ("tracker_bound", "max_pose_age", "max_edges_silence"):
             if not getattr(self, name) > 0.0:
                 raise MeasurementError(f"{name} must be above 0, not {getattr(self, name)!r}")
         if not 0.0 < self.confidence_level < 1.0:

@@ -29,7 +29,8 @@ class EdgeObservation:
 
     `stamp_ns` is the exposure time [ns]; `bearings` (2, 3) unit vectors in the lens frame; `covariances`
     (2, 3, 3) of the unit vectors [rad^2]; `angular_error` bounds each bearing's angle to the truth [rad].
-    `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code.
+    `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code,
+    `frame_id` the lens frame.
     """
 
     stamp_ns: int
@@ -39,6 +40,7 @@ class EdgeObservation:
     covariances: npt.NDArray[np.float64]
     angular_error: float
     status: int = 0
+    frame_id: str = "arthroscope_optical"
 
     def flaw(self) -> str:
         """Why the observation cannot be used, in words; empty if it can."""

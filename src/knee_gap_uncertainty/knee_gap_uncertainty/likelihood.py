@@ -123,7 +123,7 @@ def complete_frame(frame: Array) -> None:
 
 @compiled
 def start(measured: Measured, unknowns: Array) -> None:
-    """Write first unknowns: linear least squares of the distances of the rays over the depth."""
+    """Write first unknowns, over zeros: linear least squares of the distances of the rays over the depth."""
     normal = np.zeros((3, 3))
     right = np.zeros(3)
     factor = np.zeros((3, 3))
@@ -132,24 +132,24 @@ def start(measured: Measured, unknowns: Array) -> None:
     for n in range(2):
         normal[:, :] = 0.0
         right[:] = 0.0
-        columns[0] = measured.frames[n, 1]
-        columns[1] = measured.frames[n, 2]
-        columns[3] = measured.frames[n, 0]
         for i in range(measured.lens.shape[0]):
-            b = measured.bearings[i, n]
             for k in range(3):
+                columns[0, k] = measured.frames[n, 1, k]
+                columns[1, k] = measured.frames[n, 2, k]
                 columns[2, k] = measured.centre[k] - measured.lens[i, k]
+                columns[3, k] = measured.frames[n, 0, k]
             for row in range(4):
-                along = columns[row, 0] * b[0] + columns[row, 1] * b[1] + columns[row, 2] * b[2]
+                along = 0.0
                 for k in range(3):
-                    across[row, k] = columns[row, k] - along * b[k]
+                    along += columns[row, k] * measured.bearings[i, n, k]
+                for k in range(3):
+                    across[row, k] = columns[row, k] - along * measured.bearings[i, n, k]
             for row in range(3):
                 for k in range(3):
                     right[row] -= across[row, k] * across[3, k]
                     for column in range(3):
                         normal[row, column] += across[row, k] * across[column, k]
         normal[2, 2] += 1e-9 * normal[2, 2] + 1e-15
-        unknowns[n] = 0.0
         if cholesky(normal, factor):
             solve_factored(factor, right, unknowns[n])
 
@@ -178,7 +178,9 @@ def linearise(measured: Measured, used: Mask, unknowns: Array, out: Linearised) 
     for n in range(2):
         if twice[n, n] > 0.0:
             strength = min(strength, LARGEST_CORRECTION * out.information[3 * n + 2, 3 * n + 2] / twice[n, n])
-    out.corrected[:, :] = out.information
+    for row in range(6):
+        for column in range(6):
+            out.corrected[row, column] = out.information[row, column]
     for n in range(2):
         for other in range(2):
             out.score[3 * n + 2] += strength * twice[n, other] * unknowns[other, 2]
@@ -208,7 +210,8 @@ def maximise(measured: Measured, used: Mask, unknowns: Array, out: Linearised, c
                 trial[k // 3, k % 3] = unknowns[k // 3, k % 3] + step[k]
             continue
         best_cost = cost
-        unknowns[:, :] = trial
+        for k in range(6):
+            unknowns[k // 3, k % 3] = trial[k // 3, k % 3]
         if not cholesky(out.corrected, factor) or length < CONVERGED or last:
             break
         solve_factored(factor, out.score, step)

@@ -5,9 +5,11 @@ from typing import Any
 import numpy as np
 
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.pose_buffer import LensPose
 
 VALID_EDGES = 1
+TARGETS = {"snr": 0, "width": 1}
 INTERVALS = {"worst_case": 0, "paper": 1}
 SHARES = ("share_image", "share_lens_position", "share_lens_rotation", "share_common")
 
@@ -27,6 +29,7 @@ def edges_from_message(message: Any) -> EdgeObservation:
         covariances=np.array([message.covariance_0, message.covariance_1], dtype=float).reshape(2, 3, 3),
         angular_error=float(message.angular_error),
         status=int(message.status),
+        frame_id=str(message.header.frame_id),
     )
 
 
@@ -58,4 +61,20 @@ def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
         point.x, point.y, point.z = (float(value) for value in values)
     for name, share in zip(SHARES, estimate.shares, strict=True):
         setattr(message, name, float(share))
+    return message
+
+
+def fill_motion_advice(message: Any, advice: MotionAdvice, parameters: AdviceParameters) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/MotionAdvice; returns the message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(advice.stamp_ns, 1_000_000_000)
+    message.header.frame_id = advice.frame_id
+    message.track_id = advice.track_id
+    message.target_kind = TARGETS[parameters.advice_target]
+    message.target = parameters.target
+    for name, prospect in (("present", advice.present), ("best", advice.best)):
+        direction = getattr(message, f"{name}_direction")
+        direction.x, direction.y, direction.z = (float(value) for value in prospect.direction)
+        setattr(message, f"{name}_travel", float(prospect.travel))
+        setattr(message, f"{name}_best", float(prospect.best))
+        setattr(message, f"{name}_best_travel", float(prospect.best_travel))
     return message

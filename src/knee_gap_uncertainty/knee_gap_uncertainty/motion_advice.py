@@ -71,7 +71,7 @@ class AdviceParameters:
 
 
 class Situation(NamedTuple):
-    """What is known at an image that yields an estimate; all in the frame of the poses.
+    """What is known at an image; all in the frame of the poses, `frame_id` is that of the lens.
 
     `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
     coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad] and `translation_error`
@@ -80,6 +80,7 @@ class Situation(NamedTuple):
     """
 
     stamp_ns: int
+    frame_id: str
     track_id: int
     first_lens: Floats
     lens: Floats
@@ -113,9 +114,10 @@ class Prospect(NamedTuple):
 
 
 class MotionAdvice(NamedTuple):
-    """Advice at an image: along the present direction, and along the better sense of the gap."""
+    """Advice at an image: along the present direction, and along the gap; in the lens frame."""
 
     stamp_ns: int
+    frame_id: str
     track_id: int
     present: Prospect
     best: Prospect
@@ -257,7 +259,9 @@ class MotionAdvisor:
             forth = yield from self._prospect(situation, along)
             back = yield from self._prospect(situation, -along)
             best = self._better(forth, back)
-        yield self._steady(MotionAdvice(situation.stamp_ns, situation.track_id, present, best))
+        yield self._steady(
+            MotionAdvice(situation.stamp_ns, situation.frame_id, situation.track_id, present, best)
+        )
 
     def _prospect(self, situation: Situation, direction: Floats) -> Generator[None, None, Prospect]:
         """Scan one direction; yields None, returns the Prospect."""

@@ -209,7 +209,9 @@ def fit_arrays(
     covariance = np.zeros((6, 6))
     expected = considered_covariance(out, common_share, inverse, covariance)
     shares = variance_shares(measured, out, unknowns, common_share, inverse)
-    dof = 2.0 * np.sum(used) - 6.0
+    dof = -6.0
+    for i in range(count):
+        dof += 2.0 * (used[i, 0] + used[i, 1])
     ratio = cost / max(expected, SMALLEST_EXPECTED_SHARE * dof) if dof > 0.0 else np.nan
     scale = 1.0
     if count >= FEWEST_VIEWS_TO_SCALE:
@@ -270,9 +272,16 @@ def _gate(residuals: Array, used: Mask, allowed: int) -> int:
     """
     if allowed == 0:
         return 0
-    known = residuals.ravel()[~np.isnan(residuals.ravel())]
-    gate = GATE * max(1.0, np.median(known) / MEDIAN_CHI_SQUARE_2)
-    worst = np.max(known)
+    known = np.zeros(2 * residuals.shape[0])
+    count = 0
+    for i in range(residuals.shape[0]):
+        for n in range(2):
+            if used[i, n]:
+                known[count] = residuals[i, n]
+                count += 1
+    known = np.sort(known[:count])
+    gate = GATE * max(1.0, known[count // 2] / MEDIAN_CHI_SQUARE_2)
+    worst = known[count - 1]
     if not worst > gate:
         return 0
     threshold = max(gate, WITH_THE_WORST * worst)

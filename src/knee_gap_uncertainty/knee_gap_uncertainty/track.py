@@ -1,5 +1,6 @@
 """One track: the two points of the anatomy from their first view to the present one."""
 
+from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,12 +17,14 @@ from knee_gap_uncertainty.errors import (
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
+from knee_gap_uncertainty.views import Views
 
 # Why views give no number, without the values: a reason that is counted must stay the same.
 REASONS: dict[type[MeasurementError], str] = {
@@ -35,9 +38,15 @@ UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
 CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
 
 
-class AllViews(NamedTuple):
-    """The fit over all views, and the confidence interval that it gives."""
+# The direction of travel is that over this time [ns], if the lens went farther in it than this [m].
+DIRECTION_TIME_NS = 250_000_000
+DIRECTION_TRAVEL = 0.2e-3
 
+
+class AllViews(NamedTuple):
+    """The views kept and the present one, the fit over them, and the confidence interval that it gives."""
+
+    views: Views
     fit: MultiViewFit
     interval: ConfidenceInterval
 
@@ -51,6 +60,9 @@ class Track:
         self._parameters = parameters
         self._first: PosedView | None = None
         self._window = ViewWindow()
+        self._recent: deque[PosedView] = deque()
+        self._direction = np.full(3, np.nan)
+        self.situation: Situation | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
         """Whether the edges are of the same two points and the pose of the same reference frame."""
@@ -72,8 +84,10 @@ class Track:
             return replace(blank, status=GapStatus.NO_EDGES, reason=str(error))
         if self._first is None:
             self._first = view
+        self._follow_direction(view)
         try:
             all_views = self._all_views(view)
+            self.situation = self._situation(edges, view, all_views)
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
             return self._told(blank, view, REASONS.get(type(error), str(error)))
@@ -83,8 +97,42 @@ class Track:
         """Fit over the views kept and the present one."""
         kept = self._window.add(present.view)
         views = self._window.views(self._parameters.common_share)
-        fitted = fit(views if kept else views.joined(present.view))
-        return AllViews(fitted, confidence_interval(fitted, self._parameters.confidence_level))
+        views = views if kept else views.joined(present.view)
+        fitted = fit(views)
+        return AllViews(views, fitted, confidence_interval(fitted, self._parameters.confidence_level))
+
+    def _follow_direction(self, present: PosedView) -> None:
+        """Note where the lens is going; it keeps its direction while it stands still."""
+        self._recent.append(present)
+        while present.stamp_ns - self._recent[0].stamp_ns > DIRECTION_TIME_NS:
+            self._recent.popleft()
+        travel = present.lens - self._recent[0].lens
+        length = float(np.linalg.norm(travel))
+        if length > DIRECTION_TRAVEL:
+            self._direction = travel / length
+
+    def _situation(self, edges: EdgeObservation, present: PosedView, all_views: AllViews) -> Situation | None:
+        """What advice on motion can be based on; None while the points are not known at all."""
+        assert self._first is not None
+        assert all_views.views.lens_rotations is not None
+        if not np.isfinite(all_views.fit.points).all():
+            return None
+        return Situation(
+            stamp_ns=present.stamp_ns,
+            frame_id=edges.frame_id,
+            track_id=self.track_id,
+            first_lens=self._first.lens,
+            lens=present.lens,
+            rotation=all_views.views.lens_rotations[-1],
+            points=all_views.fit.points,
+            direction=self._direction,
+            angular_error=max(self._first.angular_error, present.angular_error),
+            translation_error=max(self._first.translation_error, present.translation_error),
+            interval=self._parameters.interval,
+            apex=self._parameters.apex,
+            confidence_level=self._parameters.confidence_level,
+            views=all_views.views,
+        )
 
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
         """Bounds from the first and the present view, and the smaller parallax of the two points [rad]."""
@@ -104,7 +152,7 @@ class Track:
     def _measured(
         self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews
     ) -> GapEstimate:
-        fitted, interval = all_views
+        _, fitted, interval = all_views
         estimate = replace(
             self._told(blank, view, ""),
             gap_min=bounds.gap_min,

@@ -1,4 +1,4 @@
-"""uncertainty_node: gap_edges and scope_pose in; gap, gap/min, gap/max and gap/snr out."""
+"""uncertainty_node: gap_edges and scope_pose in; gap, its bounds, and motion_advice out."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,12 +7,12 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate
+from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice
 from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
-from knee_gap_uncertainty import gap_estimate, messages
+from knee_gap_uncertainty import gap_estimate, gap_range, messages, multi_view
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_range import warm_up
+from knee_gap_uncertainty.motion_advice import AdviceParameters
 
 # A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
 GAP_DEADLINE = Duration(nanoseconds=100_000_000)
@@ -25,10 +25,12 @@ class UncertaintyNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("uncertainty_node", health=self.health)
-        self._estimator = GapEstimator(self.declare(EstimatorParameters))
+        self._advice_parameters = self.declare(AdviceParameters)
+        self._estimator = GapEstimator(self.declare(EstimatorParameters), self._advice_parameters)
         self.refuse_unknown_parameters()
         # Compiled before the first image, so that its estimate is not late.
-        warm_up()
+        gap_range.warm_up()
+        multi_view.warm_up()
         gap_qos = QoSProfile(
             depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=GAP_DEADLINE
         )
@@ -37,9 +39,18 @@ class UncertaintyNode(BaseNode):
             name: self.create_publisher(Float64, f"gap/{topic}", RESULT_QOS)
             for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr"))
         }
+        self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
-        self._tick = self.create_timer(TICK, lambda: self.publish(self._estimator.advance(self.now_ns())))
+        self._tick = self.create_timer(TICK, self.on_tick)
+
+    def on_tick(self) -> None:
+        """Let time pass: estimates that must not wait any longer, and advice that has become ready."""
+        self.publish(self._estimator.advance(self.now_ns()))
+        while self._estimator.advice:
+            advice = self._estimator.advice.popleft()
+            message = messages.fill_motion_advice(MotionAdvice(), advice, self._advice_parameters)
+            self._advice.publish(message)
 
     def on_edges(self, message: GapEdges) -> None:
         """Estimate at an image."""

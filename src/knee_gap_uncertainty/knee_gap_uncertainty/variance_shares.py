@@ -53,9 +53,24 @@ def considered_covariance(out: Linearised, common_share: float, inverse: Array, 
             for column in range(6):
                 for k in range(4):
                     spread[row, column] += lever[row, k] * lever[column, k]
-    through = inverse @ (out.information - spread + total @ total.T)
-    covariance[:, :] = through @ inverse
-    return float(max(2.0 * bearing_count - np.trace(through), 0.0))
+    for row in range(6):
+        for column in range(6):
+            spread[row, column] = out.information[row, column] - spread[row, column]
+            for k in range(4):
+                spread[row, column] += total[row, k] * total[column, k]
+    expected = 2.0 * bearing_count
+    through = np.zeros((6, 6))
+    for row in range(6):
+        for column in range(6):
+            for k in range(6):
+                through[row, column] += inverse[row, k] * spread[k, column]
+        expected -= through[row, row]
+    for row in range(6):
+        for column in range(6):
+            covariance[row, column] = 0.0
+            for k in range(6):
+                covariance[row, column] += through[row, k] * inverse[k, column]
+    return float(max(expected, 0.0))
 
 
 @compiled
@@ -82,7 +97,11 @@ def variance_shares(
     shares = np.full(4, np.nan)
     if not (unknowns[0, 2] > 0.0 and unknowns[1, 2] > 0.0):
         return shares
-    through = inverse @ gap_gradient(measured.frames, unknowns)
+    gradient = gap_gradient(measured.frames, unknowns)
+    through = np.zeros(6)
+    for row in range(6):
+        for k in range(6):
+            through[row] += inverse[row, k] * gradient[k]
     common = np.zeros((2, 2))
     root = np.zeros((2, 2, 2))
     slope = np.zeros(4)
@@ -117,8 +136,11 @@ def variance_shares(
             for k in range(3):
                 shares[1] += position[row] * measured.lens_covariances[i, row, k] * position[k]
                 shares[2] += turn[row] * measured.rotation_covariances[i, row, k] * turn[k]
-    shares[3] = np.sum(common**2)
-    shares /= np.sum(shares)
+    for n in range(2):
+        shares[3] += common[n, 0] ** 2 + common[n, 1] ** 2
+    total = shares[0] + shares[1] + shares[2] + shares[3]
+    for k in range(4):
+        shares[k] /= total
     return shares
 
 

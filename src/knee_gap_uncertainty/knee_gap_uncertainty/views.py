@@ -85,6 +85,21 @@ class Views:
                 f"not {deviations.max():.3g}"
             )
 
+    def joined(self, other: "Views") -> "Views":
+        """These views and then `other`'s, with the common share of these."""
+        rotations = (self.lens_rotations, other.lens_rotations)
+        return Views(
+            lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
+            bearings=np.concatenate([self.bearings, other.bearings]),
+            bearing_covariances=np.concatenate([self.bearing_covariances, other.bearing_covariances]),
+            lens_covariances=np.concatenate([self.lens_covariances, other.lens_covariances]),
+            rotation_covariances=np.concatenate([self.rotation_covariances, other.rotation_covariances]),
+            common_share=self.common_share,
+            lens_rotations=None
+            if rotations[0] is None or rotations[1] is None
+            else np.concatenate([rotations[0], rotations[1]]),
+        )
+
     def __len__(self) -> int:
         """Number of views."""
         return len(self.lens_positions)

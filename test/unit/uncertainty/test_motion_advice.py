@@ -40,6 +40,7 @@ def situation(
     )
     return Situation(
         stamp_ns=0,
+        frame_id="arthroscope_optical",
         track_id=1,
         first_lens=lens[0],
         lens=lens[-1],
