@@ -68,8 +68,8 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
 def interval_ends(frames: Array, unknowns: Array, covariance: Array, radius: float) -> tuple[float, float]:
     """Lower and upper end [m] at the level whose two-sided normal deviate is `radius`.
 
-    `unknowns` (2, 3) and `covariance` (6, 6) as in MultiViewFit. The upper end is infinite where the ellipsoid
-    reaches an inverse depth of 0.
+    `unknowns` (2, 3) and `covariance` (6, 6) as in MultiViewFit. The upper end is infinite where the
+    ellipsoid reaches an inverse depth of 0.
     """
     root = np.zeros((6, 6))
     if not cholesky(covariance, root):
@@ -127,4 +127,4 @@ def _radius_there(
             slopes[n] += element * normal[k] / np.sqrt(max(length, 1e-300))
         margins[n] = there / np.sqrt(variance) - 1.0 / LARGEST_INVERSE_DEPTH_VARIATION
         slopes[n] /= np.sqrt(variance)
-    return radius_at(apart, spread, margins, slopes, radius)
+    return float(radius_at(apart, spread, margins, slopes, radius))

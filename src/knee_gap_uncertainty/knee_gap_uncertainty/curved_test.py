@@ -1,15 +1,16 @@
 """How far an accepted estimate strays from a curved surface that holds the truth, compiled.
 
-An interval of the distance between two points holds a value d0 while the estimate lies within a radius k, in standard
-deviations, of the surface on which the distance is d0. For a plane the chance to be farther is that of a normal
-deviate. Two things change it.
+An interval of the distance between two points holds a value d0 while the estimate lies within a radius k, in
+standard deviations, of the surface on which the distance is d0. For a plane the chance to be farther is that
+of a normal deviate. Two things change it.
 
-The surface of a constant distance is an ellipsoid there; where a standard deviation is of the size of the distance
-itself it is strongly curved, and an estimate outside it is farther from it than from its tangent plane.
+The surface of a constant distance is an ellipsoid there; where a standard deviation is of the size of the
+distance itself it is strongly curved, and an estimate outside it is farther from it than from its tangent
+plane.
 
-Only estimates of enough parallax are accepted. A point whose depth is near the limit is accepted when its error
-makes it seem nearer than it is, and of those the same radius holds far fewer; on the other side, the estimates that
-would have missed are those refused. The chance that counts is the one among the accepted.
+Only estimates of enough parallax are accepted. A point whose depth is near the limit is accepted when its
+error makes it seem nearer than it is, and of those the same radius holds far fewer; on the other side, the
+estimates that would have missed are those refused. The chance that counts is the one among the accepted.
 """
 
 from math import erfc, sqrt
@@ -46,9 +47,9 @@ def radius_at(
     """Radius [-] that an accepted estimate strays beyond with the two-sided chance of `plane_radius`.
 
     The surface holds all differences (3,) [m] of the length of `difference`, whose place on it is where the
-    estimate is nearest; `covariance` (3, 3) [m^2] of the difference. Of each point, were it there: `margins` (2,)
-    says how many standard deviations of its inverse depth it lies inside the limit of acceptance and `slopes` (2,)
-    the correlation of that inverse depth with the distance.
+    estimate is nearest; `covariance` (3, 3) [m^2] of the difference. Of each point, were it there: `margins`
+    (2,) says how many standard deviations of its inverse depth it lies inside the limit of acceptance and
+    `slopes` (2,) the correlation of that inverse depth with the distance.
     """
     product = np.zeros(3)
     gradient, steepness, squared = 0.0, 0.0, 0.0
@@ -106,8 +107,9 @@ def accepted_above(margins: Array, slopes: Array) -> Array:
 def stray_probability(radius: float, first: float, second: float, chord: float, above: Array) -> float:
     """Chance that an estimate is farther than `radius` from a convex surface through the truth, and accepted.
 
-    `first` and `second` are its radii of curvature there and `chord` how far the surface is on the other side,
-    all in standard deviations. Along the surface the estimate strays normally and the surface falls away from it.
+    `first` and `second` are its radii of curvature there and `chord` how far the surface is on the other
+    side, all in standard deviations. Along the surface the estimate strays normally and the surface falls
+    away from it.
     """
     total = 0.0
     for i in range(5):
@@ -130,11 +132,11 @@ def _look_up(above: Array, deviation: float) -> float:
     """Value of a table on the grid of deviations, linear between."""
     place = deviation / GRID_STEP + GRID_COUNT // 2
     if not place > 0.0:
-        return above[0]
+        return float(above[0])
     if place >= GRID_COUNT - 1:
         return 0.0
     i = int(place)
-    return above[i] + (place - i) * (above[i + 1] - above[i])
+    return float(above[i] + (place - i) * (above[i + 1] - above[i]))
 
 
 @compiled

@@ -1,8 +1,9 @@
 """Smallest and largest distance of two points over the confidence ellipsoid of their unknowns, compiled.
 
-The ellipsoid is the image of the unit ball: unknowns + factor @ unit, |unit| <= 1, for a lower factor (6, 6) and the
-unknowns (2, 3) a, b, rho of both points in their `frames` (2, 3, 3), as in `likelihood`. Each function writes where
-it found the extreme: the unit vector (6,), the difference G_1 - G_0 (3,) [m] and its slope (3, 6) by the unit vector.
+The ellipsoid is the image of the unit ball: unknowns + factor @ unit, |unit| <= 1, for a lower factor (6, 6)
+and the unknowns (2, 3) a, b, rho of both points in their `frames` (2, 3, 3), as in `likelihood`. Each
+function writes where it found the extreme: the unit vector (6,), the difference G_1 - G_0 (3,) [m] and its
+slope (3, 6) by the unit vector.
 """
 
 import numpy as np
@@ -51,10 +52,10 @@ def difference(
 def largest_distance(
     frames: Array, unknowns: Array, factor: Array, unit: Array, apart: Array, slope: Array
 ) -> float:
-    """Largest distance [m], infinite where the ellipsoid reaches infinity: fixed-point ascent over its surface.
+    """Largest distance [m], infinite where the ellipsoid reaches infinity: fixed-point ascent.
 
-    It starts along the present difference and, because a gap of the size of its error can grow to either side,
-    along both senses of each axis of space.
+    It starts along the present difference and, because a gap of the size of its error can grow to either
+    side, along both senses of each axis of space.
     """
     for n in range(2):
         reach = 0.0
@@ -108,7 +109,7 @@ def largest_distance(
 def smallest_distance(
     frames: Array, unknowns: Array, factor: Array, unit: Array, apart: Array, slope: Array
 ) -> float:
-    """Smallest distance [m]: Gauss-Newton of the difference to zero, each step the best inside the ellipsoid."""
+    """Smallest distance [m]: Gauss-Newton of the difference to zero inside the ellipsoid."""
     unit[:] = 0.0
     trial = np.zeros(6)
     target = np.zeros(3)
