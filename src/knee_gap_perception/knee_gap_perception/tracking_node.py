@@ -1,14 +1,26 @@
-"""tracking_node: poses of the tracked scope body in; scope_pose, the pose of the lens with its error, out."""
+"""tracking_node: the tracked scope in, from a topic or Motive; scope_pose, the lens with its error, out."""
 
+import threading
 from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from knee_gap_node.base_node import RESULT_QOS, TRACKER_QOS, BaseNode, run
-from knee_gap_perception.messages_tracking import body_pose_from_message, fill_lens_pose
+from knee_gap_node.errors import ConfigurationError
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.messages_tracking import fill_lens_pose
+from knee_gap_perception.optitrack.natnet_client import NatNetParameters
+from knee_gap_perception.optitrack.pose_topic import PoseTopics
+from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
+from knee_gap_perception.optitrack.scope_feed import SCOPE, ScopeFeed, SourceParameters
 from knee_gap_perception.pose_validity import ValidityParameters
-from knee_gap_perception.poses import BodyPose, LensPose
+from knee_gap_perception.poses import LensPose
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+
+# How long one look at NatNet's socket may wait [s]: as long as the node may take to end.
+NATNET_WAIT = 0.1
 
 
 class TrackingNode(BaseNode):
@@ -16,31 +28,90 @@ class TrackingNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("tracking_node", health=self.health)
-        self._tracker = ScopeTracker(self.declare(TrackingParameters), self.declare(ValidityParameters))
+        parameters = self.declare(TrackingParameters)
+        self._tracker = ScopeTracker(parameters, self.declare(ValidityParameters))
+        source, natnet = self.declare(SourceParameters), self.declare(NatNetParameters)
         self.refuse_unknown_parameters()
         self._accepted_before = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
-        self.create_subscription(PoseStamped, "scope_body/pose", self.on_pose, TRACKER_QOS)
-
-    def on_pose(self, message: PoseStamped) -> None:
-        """Take a pose as a driver publishes it."""
-        self.on_body(body_pose_from_message(message))
-
-    def on_body(self, body: BodyPose) -> None:
-        """Publish the lens pose of a body, or log why there is none."""
-        lens = self._tracker.update(body)
-        if isinstance(lens, LensPose):
-            self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
+        try:
+            self._feed = ScopeFeed(
+                source, natnet, reference_body=parameters.reference_body, ros_now=self.now_ns
+            )
+        except PerceptionError as error:
+            raise ConfigurationError(str(error)) from error
+        self._ended = threading.Event()
+        self._receiver: threading.Thread | None = None
+        if isinstance(self._feed.source, PoseTopics):
+            self.listen_to_poses(self._feed.source, parameters.reference_body)
+        elif isinstance(self._feed.source, RigidBodiesTopic):
+            self.listen_to_rigid_bodies(self._feed.source)
         else:
-            self.log_once(lens.reason, f"pose refused: {lens.detail}")
+            self._receiver = threading.Thread(target=self.receive, daemon=True)
+            self._receiver.start()
+
+    def now_ns(self) -> int:
+        """Time of ROS, which NatNet's exposures are mapped to."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def listen_to_poses(self, source: PoseTopics, reference_body: str) -> None:
+        """Subscribe to the scope's pose, and to the leg's where one is the reference."""
+        topics = {SCOPE: "scope_body/pose"}
+        if reference_body:
+            topics[reference_body] = "reference_body/pose"
+        for name, topic in topics.items():
+            self.create_subscription(
+                PoseStamped, topic, partial(self.on_message, partial(source.put, name)), TRACKER_QOS
+            )
+
+    def listen_to_rigid_bodies(self, source: RigidBodiesTopic) -> None:
+        """Subscribe to all bodies at once. Raises ConfigurationError where the messages are not installed."""
+        try:
+            from mocap4r2_msgs.msg import RigidBodies  # an optional package, needed by this source only
+        except ImportError as error:
+            raise ConfigurationError(
+                "source rigid_bodies needs the package mocap4r2_msgs, which is not installed"
+            ) from error
+        self.create_subscription(
+            RigidBodies, "rigid_bodies", partial(self.on_message, source.put), TRACKER_QOS
+        )
+
+    def on_message(self, put: Any, message: Any) -> None:
+        """Take a message into the source, and publish what it completes."""
+        put(message)
+        self.publish_polled(0.0)
+
+    def receive(self) -> None:
+        """Publish what Motive sends, until the node ends; in a thread of its own, because it waits."""
+        while not self._ended.is_set():
+            self.publish_polled(NATNET_WAIT)
+
+    def publish_polled(self, timeout: float) -> None:
+        """Publish the lens pose of each new frame, or log why there is none."""
+        for body, others in self._feed.poll(timeout):
+            lens = self._tracker.update(body, others)
+            if isinstance(lens, LensPose):
+                self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
+            else:
+                self.log_once(lens.reason, f"pose refused: {lens.detail}")
+
+    def destroy_node(self) -> None:
+        """End the receiver before what it publishes with."""
+        self._ended.set()
+        if self._receiver is not None:
+            self._receiver.join()
+        self._feed.close()
+        super().destroy_node()
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """How many poses were accepted since the last time, and how many refused for which reason."""
+        """How the source fares, how many poses were accepted since the last time, and what was refused."""
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
-        words = f"{accepted} poses in the last second" if accepted else "no pose accepted in the last second"
+        source = self._feed.status()
         refused = {f"refused: {reason}": count for reason, count in self._tracker.validity.counts.items()}
-        return accepted > 0, words, {"accepted": self._tracker.accepted_count, **refused}
+        words = f"{accepted} poses in the last second" if source.ok else source.words
+        counts = {"accepted": self._tracker.accepted_count, **source.values, **refused}
+        return source.ok and accepted > 0, words, counts
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,96 @@
+"""tracking_node on Motive's own protocol: poses with the time of exposure, and a restart survived."""
+
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from live import Client
+
+from knee_gap_bringup.processes import Processes, executable
+
+DOMAIN = 53
+ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+NODE = ("--ros-args", "-r", "__ns:=/knee_gap")
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def stamp(message: PoseWithCovarianceStamped) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+@pytest.mark.parametrize("version", ["3.0", "4.1"])
+def test_poses_come_from_motive_and_come_back_after_a_restart(version: str, tmp_path: Path) -> None:
+    port = str(free_port())
+    server = [executable("knee_gap_simulation", "natnet_server"), "--version", version, "--rate", "120"]
+    server += ["--command-port", port, "--latency-ms", "4"]
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        processes.start("server", server)
+        node = [executable("knee_gap_perception", "tracking_node"), *NODE]
+        parameters = {"source": "natnet", "body": "scope", "command_port": port}
+        for name, value in parameters.items():
+            node += ["-p", f"{name}:={value}"]
+        processes.start("tracking_node", node)
+        client.listen(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(DiagnosticArray, "/diagnostics")
+        processes.wait_ready(["tracking_node"], 60.0)
+        poses = client.received["scope_pose"]
+        client.spin_until(lambda: len(poses) > 120, timeout=30.0)
+        stamps = np.array([stamp(message) for message in poses])
+        assert (np.diff(stamps) > 0.0).all()
+        assert np.median(np.diff(stamps)) == pytest.approx(1 / 120, abs=5e-4)
+        # Exposure lies before arrival, by the latency that the server was told and not by much more.
+        assert 0.0 < time.time() - stamp(poses[-1]) < 1.0
+
+        processes.end("server")
+        client.spin(1.5)
+        before = len(poses)
+        client.spin(1.0)
+        assert len(poses) == before
+        told = [status for array in client.received["/diagnostics"] for status in array.status]
+        assert told[-1].level != b"\x00"
+        assert told[-1].message
+
+        processes.start("server_again", server)
+        client.spin_until(lambda: len(poses) > before + 60, timeout=40.0)
+        assert processes.end("tracking_node") == 0
+
+
+def test_leg_as_reference(tmp_path: Path) -> None:
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        node = [executable("knee_gap_perception", "tracking_node"), *NODE, "-p", "reference_body:=tibia"]
+        processes.start("tracking_node", node)
+        client.offer(PoseStamped, "scope_body/pose")
+        client.offer(PoseStamped, "reference_body/pose")
+        client.listen(PoseWithCovarianceStamped, "scope_pose")
+        processes.wait_ready(["tracking_node"], 60.0)
+        client.wait_matched()
+        rng = np.random.default_rng(5)
+        for k in range(60):
+            # Leg and scope move together: against the leg the scope stands still.
+            shift = 1e-4 * k
+            for topic, offset in (("reference_body/pose", 0.0), ("scope_body/pose", 0.1)):
+                message = PoseStamped()
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(10**18 + k * 8_333_333, 10**9)
+                message.header.frame_id = "world"
+                message.pose.position.x = offset + shift + rng.normal(0.0, 1e-6)
+                message.pose.orientation.w = 1.0
+                client.publish(topic, message)
+            client.spin(0.008)
+        poses = client.received["scope_pose"]
+        client.spin_until(lambda: len(poses) > 40)
+        assert {message.header.frame_id for message in poses} == {"tibia"}
+        assert [m.pose.pose.position.x for m in poses] == pytest.approx([0.1] * len(poses), abs=1e-4)
