@@ -84,8 +84,8 @@ class ValidityParameters:
     jump_hold: float = field(
         default=10.0,
         metadata={
-            "description": "Time after a jump in which poses are refused unless the body comes back to where "
-            "it was [s]: a swapped label must not become the scope; infinite waits for the return",
+            "description": "Time after a jump or a swap of labels in which poses are refused unless the body "
+            "comes back to where it was [s]; infinite waits for the return",
             "range": (0.0, inf),
         },
     )
@@ -129,6 +129,7 @@ class PoseValidity:
         self._before_jump: BodyPose | None = None
         self._jump_stamp_ns = 0
         self._swapped = SwappedBodies()
+        self._swap_stamp_ns: int | None = None
 
     @property
     def period(self) -> float:
@@ -139,7 +140,11 @@ class PoseValidity:
 
     def check(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> Refusal | None:
         """Return why `body` is not to be believed, or None; `others` are the bodies of the same frame."""
-        found = self._stamp_fault(body) or self._form_fault(body) or self._motion_fault(body, tuple(others))
+        found = self._stamp_fault(body)
+        if found is None:
+            # In every frame, also while the body itself is not seen: the others move meanwhile.
+            swapped_with = self._swapped_with(body, tuple(others))
+            found = self._form_fault(body) or self._motion_fault(body, swapped_with)
         if found is None:
             return None
         return self.refuse(body, *found)
@@ -185,12 +190,28 @@ class PoseValidity:
             )
         return None
 
-    def _motion_fault(self, body: BodyPose, others: tuple[BodyPose, ...]) -> tuple[RefusalReason, str] | None:
+    def _swapped_with(self, body: BodyPose, others: tuple[BodyPose, ...]) -> str | None:
+        other = self._swapped.update((body, *others)).get(body.name)
+        if other is None:
+            # Not seen is no return: the time of a swap goes on until the label is back on its body.
+            if body.tracking_valid:
+                self._swap_stamp_ns = None
+            return None
+        if self._swap_stamp_ns is None:
+            self._swap_stamp_ns = body.stamp_ns
+        if body.stamp_ns - self._swap_stamp_ns < self.parameters.jump_hold * 1e9:
+            return other
+        self._swapped = SwappedBodies()
+        self._swapped.update((body, *others))
+        self._swap_stamp_ns = None
+        return None
+
+    def _motion_fault(self, body: BodyPose, swapped_with: str | None) -> tuple[RefusalReason, str] | None:
         last = self._last
         if last is not None and _identical(last, body):
             return RefusalReason.FROZEN, "the pose repeats the one before it bit by bit: the driver is frozen"
-        if other := self._swapped.update(body, others, self._reach):
-            return RefusalReason.SWAPPED, f"the tracker calls '{other}' by the name of the body"
+        if swapped_with is not None:
+            return RefusalReason.SWAPPED, f"the tracker calls '{swapped_with}' by the name of the body"
         self._last = body
         if last is None:
             return None

@@ -1,60 +1,56 @@
-"""Whether the tracker has exchanged the labels of two bodies."""
+"""Whether the tracker has exchanged the labels of bodies."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
-from knee_gap_perception.poses import BodyPose
+from knee_gap_perception.poses import Array, BodyPose
 
+# A label is on another body when it is this many times nearer to that body's last place than to its own.
 MUCH_NEARER = 4.0
 # Two bodies are never this close [m], so a label that moved less has not been swapped.
 SEPARATION = 0.005
-
-Reach = Callable[[BodyPose, BodyPose], float]
+# Where a body was so long ago [ns] says nothing about where it is.
+FORGET_NS = 10_000_000_000
 
 
 class SwappedBodies:
-    """Follows bodies by where they are and compares that with what the tracker calls them.
+    """Follows bodies by where they are, and compares that with what the tracker calls them.
 
-    A label that leaves its body for the place of another body, while that other label comes to the first
-    place or is gone, has been swapped; it stays so until it swaps back.
+    Each frame is judged afresh from the last place of each body, so that a swap which began or ended unseen,
+    behind an occlusion, does not turn the names round for good.
     """
 
     def __init__(self) -> None:
-        self._last: dict[str, BodyPose] = {}
-        self._body_of_label: dict[str, str] = {}
+        self._places: dict[str, tuple[int, Array]] = {}
 
-    def update(self, body: BodyPose, others: Sequence[BodyPose], reach: Reach) -> str | None:
-        """Take the bodies of one frame; return the body that the label of `body` is on, if not its own.
+    def update(self, bodies: Iterable[BodyPose]) -> dict[str, str]:
+        """Take the bodies of one frame; return, for each label that is on another body, that body's name."""
+        seen = {
+            body.name: body for body in bodies if body.tracking_valid and np.isfinite(body.position).all()
+        }
+        claims = {label: claim for label, body in seen.items() if (claim := self._claim(label, body))}
+        # A body that is seen where it was, under its own name, is not to be had by another label.
+        while taken := [label for label, claim in claims.items() if claim in seen and claim not in claims]:
+            for label in taken:
+                del claims[label]
+        for label, body in seen.items():
+            self._places[claims.get(label, label)] = (body.stamp_ns, body.position)
+        return claims
 
-        `reach(start, end)` is how far two poses are from each other as a share of what the fastest motion
-        reaches in the time between them; above 1 they are not of the same body.
-        """
-        seen = {pose.name: pose for pose in (body, *others) if pose.tracking_valid}
-        for first in seen:
-            for second in self._last:
-                if first != second and self._exchanged(seen, first, second, reach):
-                    self._exchange(first, second)
-                    self._last[first], self._last[second] = self._last[second], self._last[first]
-        self._last.update(seen)
-        holder = self._body_of_label.get(body.name, body.name)
-        return None if holder == body.name else holder
+    def _claim(self, label: str, body: BodyPose) -> str | None:
+        """The other body whose place the label has come to, if it left its own for it."""
+        own = self._distance(label, body)
+        if own is None or own < SEPARATION:
+            return None
+        others = ((self._distance(name, body), name) for name in self._places if name != label)
+        near = [(distance, name) for distance, name in others if distance is not None]
+        if not near or MUCH_NEARER * min(near)[0] >= own:
+            return None
+        return min(near)[1]
 
-    def _exchanged(self, seen: dict[str, BodyPose], first: str, second: str, reach: Reach) -> bool:
-        if first not in self._last:
-            return False
-        if np.abs(seen[first].position - self._last[first].position).max() < SEPARATION:
-            return False
-        own, foreign = reach(self._last[first], seen[first]), reach(self._last[second], seen[first])
-        if second not in seen:
-            return foreign <= 1.0 < own
-        # Compared with each other, not with 1: after a drop-out both places may be within reach.
-        other_own, other_foreign = (
-            reach(self._last[second], seen[second]),
-            reach(self._last[first], seen[second]),
-        )
-        return MUCH_NEARER * foreign < own and MUCH_NEARER * other_foreign < other_own
-
-    def _exchange(self, first: str, second: str) -> None:
-        holders = self._body_of_label
-        holders[first], holders[second] = holders.get(second, second), holders.get(first, first)
+    def _distance(self, name: str, body: BodyPose) -> float | None:
+        place = self._places.get(name)
+        if place is None or body.stamp_ns - place[0] > FORGET_NS:
+            return None
+        return float(np.linalg.norm(body.position - place[1]))

@@ -39,7 +39,8 @@ class Faults:
 class TrackedScene:
     """Bodies with streaming ids from 1, swaying as in hands, each about its own place; Y up, as in Motive.
 
-    A body that is not seen keeps its last pose with the valid bit cleared, as Motive does it.
+    Faults with a period count from the first frame, which is sound. A body that is not seen keeps its last
+    pose with the valid bit cleared, as Motive does it.
     """
 
     names: tuple[str, ...]
@@ -52,6 +53,7 @@ class TrackedScene:
             raise SimulationError(f"bodies need names that differ, not {', '.join(self.names) or 'none'}")
         self._rng = np.random.default_rng(self.seed)
         self._last: dict[int, BodyInFrame] = {}
+        self._start_s = float("nan")
 
     def models(self) -> list[BodyModel]:
         """Definitions of the bodies."""
@@ -64,8 +66,11 @@ class TrackedScene:
 
     def bodies(self, time_s: float) -> list[BodyInFrame]:
         """The bodies at a time of exposure [s], with the faults of that moment."""
+        if np.isnan(self._start_s):
+            self._start_s = time_s
         seen = [self._body(number, time_s) for number in range(1, len(self.names) + 1)]
-        if len(seen) > 1 and _within(time_s, self.faults.swap_period, self.faults.swap_length):
+        since = time_s - self._start_s
+        if len(seen) > 1 and _within(since, self.faults.swap_period, self.faults.swap_length):
             seen[0], seen[1] = _relabeled(seen[0], 2), _relabeled(seen[1], 1)
             seen[0], seen[1] = seen[1], seen[0]
         return seen
@@ -102,7 +107,8 @@ class TrackedScene:
     def _hidden(self, number: int, time_s: float) -> bool:
         if self._rng.random() < self.faults.invalid_share:
             return True
-        return number == 1 and _within(time_s, self.faults.occlusion_period, self.faults.occlusion_length)
+        since = time_s - self._start_s
+        return number == 1 and _within(since, self.faults.occlusion_period, self.faults.occlusion_length)
 
 
 def _relabeled(body: BodyInFrame, number: int) -> BodyInFrame:

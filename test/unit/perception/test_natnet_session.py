@@ -204,9 +204,9 @@ class TestStamps:
     def test_the_clock_alone(self):
         clock = EchoClock(1_000_000)
         assert not clock.ready(0)
-        for index in range(3):
+        for index in range(6):
             clock.add(index * SECOND, index * SECOND + 2000, index * 1_000_000 + 5001)
-        assert clock.ready(3 * SECOND)
+        assert clock.ready(6 * SECOND)
         assert clock.local_ns(5001) == pytest.approx(1000, abs=1)
         assert clock.error_ns == 1000
         assert not clock.ready(100 * SECOND)
@@ -338,7 +338,7 @@ class TestCapturedTraffic:
         assert session.counts["malformed packets"] == 0
         assert session.names == {2: "RaceQuad"}
         stamps = np.array([frame.stamp_ns for frame in frames if frame is not None])
-        assert len(stamps) > 180
+        assert len(stamps) > 60
         assert np.median(np.diff(stamps)) == pytest.approx(8.333 * MILLISECOND, rel=0.01)
         assert (np.diff(stamps) > 0).all()
         assert clock.error_ns < MILLISECOND

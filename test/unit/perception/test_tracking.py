@@ -259,6 +259,57 @@ class TestSwappedBodies:
         assert found[200] is RefusalReason.GAP
         assert set(found[:100] + found[201:]) == {None}
 
+    @pytest.mark.parametrize("hidden", [range(180, 230), range(90, 110), range(90, 230)])
+    def test_a_swap_that_begins_or_ends_behind_an_occlusion_does_not_turn_the_names_round(self, hidden):
+        tracker, wrong, accepted = ScopeTracker(), 0, set()
+        for i in range(400):
+            scope, leg = hand_motion(i), hand_motion(i + 77, name="leg", centre=(0.2, 0.1, 0.0))
+            leg = replace(leg, stamp_ns=scope.stamp_ns)
+            true = scope.position
+            scope = replace(scope, tracking_valid=i not in hidden)
+            if 100 <= i < 200:
+                scope, leg = replace(leg, name="scope"), replace(scope, name="leg")
+            result = tracker.update(scope, [leg])
+            if isinstance(result, LensPose):
+                accepted.add(i)
+                wrong += bool(np.linalg.norm(scope.position - true) > 1e-3)
+        assert wrong == 0
+        assert set(range(240, 400)) <= accepted
+
+    def test_labels_that_stay_are_believed_when_the_hold_is_over(self):
+        """As after a start with swapped labels, which nothing can tell."""
+        tracker, found = ScopeTracker(validity=ValidityParameters(jump_hold=1.0)), []
+        for i in range(400):
+            scope, leg = hand_motion(i), hand_motion(i, name="leg", centre=(0.2, 0.1, 0.0))
+            if i < 100:
+                scope, leg = replace(leg, name="scope"), replace(scope, name="leg")
+            result = tracker.update(scope, [leg])
+            found.append(result.reason if isinstance(result, Refusal) else None)
+        assert set(found[100:220]) == {RefusalReason.SWAPPED}
+        assert set(found[222:]) == {None}
+
+    def test_labels_that_go_round_among_three_bodies(self):
+        tracker, names, accepted = ScopeTracker(), ["scope", "leg", "probe"], []
+        for i in range(300):
+            bodies = [hand_motion(i, centre=(0.15 * k, 0.05 * k, 0.0)) for k in range(3)]
+            turned = names[1:] + names[:1] if 100 <= i < 200 else names
+            frame = {name: replace(body, name=name) for name, body in zip(turned, bodies, strict=True)}
+            scope = frame.pop("scope")
+            accepted.append(isinstance(tracker.update(scope, frame.values()), LensPose))
+        assert not any(accepted[100:200])
+        assert all(accepted[:100] + accepted[201:])
+
+    def test_a_scope_that_moved_beside_the_leg_unseen_is_no_leg(self):
+        tracker, found = ScopeTracker(), []
+        for i in range(600):
+            leg = replace(
+                hand_motion(0, name="leg", centre=(0.1, 0.0, 0.0)), stamp_ns=hand_motion(i).stamp_ns
+            )
+            scope = hand_motion(i) if i < 100 else moved(hand_motion(i), [0.08, 0.0, 0.0])
+            scope = replace(scope, tracking_valid=not 100 <= i < 400)
+            found.append(tracker.update(scope, [leg]))
+        assert all(isinstance(result, LensPose) for result in found[401:])
+
     def test_labels_swapped_in_a_drop_out_are_seen(self):
         # 60 frames are half a second: at 1 m/s either place could have been reached.
         found = self.run(swapped=range(160, 300), missing=range(100, 160))

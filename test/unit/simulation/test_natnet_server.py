@@ -99,20 +99,20 @@ def test_poses_are_those_of_the_scene_turned_to_z_up():
 
 
 def test_no_hidden_or_swapped_pose_is_published():
-    """Two minutes of faults, through the packets and the checks, without the sockets."""
+    """Faults in every phase to each other, through the packets and the checks, without the sockets."""
     faults = Faults(
         lost_share=0.01,
         invalid_share=0.02,
         occlusion_period=0.7,
         occlusion_length=0.2,
-        swap_period=1.1,
+        swap_period=1.13,
         swap_length=0.3,
     )
     scene, tracker, worst = TrackedScene(("scope", "tibia", "clock"), faults, seed=3), ScopeTracker(), 0.0
-    for number in range(120 * 120):
+    for number in range(300 * 120):
         time_s = 1000.0 + number / 120.0
         content = packets.FrameContent(number=number, bodies=scene.bodies(time_s))
-        if scene.frame_is_lost():
+        if scene.frame_is_lost() or number / 120.0 % 9.7 > 8.0:
             continue
         frame = decode_packet(packets.frame((4, 1), content), NatNetVersion(4, 1))
         body, *others = (
@@ -127,7 +127,7 @@ def test_no_hidden_or_swapped_pose_is_published():
         )
         if isinstance(tracker.update(body, others), LensPose):
             worst = max(worst, float(np.linalg.norm(body.position - scene.true_pose(1, time_s)[0])))
-    assert tracker.accepted_count > 120 * 120 * 0.4
+    assert tracker.accepted_count > 300 * 120 * 0.35
     assert worst < 2e-4
     counts = tracker.validity.counts
     assert counts[RefusalReason.NOT_TRACKED] > 1000

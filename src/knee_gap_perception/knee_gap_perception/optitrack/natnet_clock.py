@@ -12,6 +12,8 @@ MAX_DRIFT = 2e-4
 RATE_KNOWN_AFTER_NS = 3 * NANOSECONDS
 # Without an echo for so long the clock is no longer trusted [ns].
 MAX_AGE_NS = 60 * NANOSECONDS
+# Of fewer echoes, none may have been a quick one.
+FEWEST_ECHOES = 6
 # An echo that is this far outside of what the clock says means another clock: the server restarted [ns].
 RESTART_NS = 2_000_000
 
@@ -46,8 +48,8 @@ class EchoClock:
         return self._error_ns
 
     def ready(self, now_ns: int) -> bool:
-        """Whether ticks can be mapped to within `max_error_ns`: by three echoes, the last not long ago."""
-        enough = len(self._echoes) >= 3 and self._error_ns <= self.max_error_ns
+        """Whether ticks can be mapped to within `max_error_ns`: by some echoes, the last not long ago."""
+        enough = len(self._echoes) >= FEWEST_ECHOES and self._error_ns <= self.max_error_ns
         return enough and now_ns - self._echoes[-1].local_ns <= MAX_AGE_NS
 
     def add(self, sent_ns: int, received_ns: int, ticks: int) -> None:

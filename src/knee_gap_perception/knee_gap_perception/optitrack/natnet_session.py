@@ -22,8 +22,11 @@ Address = tuple[str, int]
 FIRST_RETRY_NS = NANOSECONDS // 4
 LAST_RETRY_NS = 4 * NANOSECONDS
 ECHO_NS = NANOSECONDS // 2
-# The first echoes follow each other closely, so that stamps are there soon.
+# The first echoes follow each other closely, so that stamps are there soon; more of them while the clock is
+# known only roughly.
 FIRST_ECHOES = 8
+MOST_FIRST_ECHOES = 60
+FINE_CLOCK_NS = 100_000
 FIRST_ECHO_NS = 20_000_000
 KEEP_ALIVE_NS = NANOSECONDS // 2
 MODELS_NS = 2 * NANOSECONDS
@@ -102,7 +105,8 @@ class NatNetSession:
         if self._keep_alive.take(now_ns):
             due.append(packets.encode_request(MessageId.KEEP_ALIVE))
         if self.clock is not None and self._echo.take(now_ns):
-            if self._echo_count < FIRST_ECHOES:
+            rough = self.clock.error_ns > FINE_CLOCK_NS and self._echo_count < MOST_FIRST_ECHOES
+            if self._echo_count < FIRST_ECHOES or rough:
                 self._echo.at_ns = now_ns + FIRST_ECHO_NS
             self._echo_count += 1
             self._echoes_sent.append(now_ns)
