@@ -13,7 +13,8 @@ pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from live import RELIABLE, Client
+from live import Client
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from knee_gap_bringup.processes import Processes, executable
@@ -128,16 +129,21 @@ def test_every_bad_image_gets_a_status_and_good_ones_go_on(
     assert "Traceback" not in processes.log("segmentation_node").read_text()
 
 
-def test_mask_is_there_once_somebody_listens(
+def test_mask_and_overlay_are_there_once_somebody_listens(
     segmentation: tuple[Client, Processes], frames: list[np.ndarray], camera: CameraInfo
 ) -> None:
     client, _ = segmentation
     client.publish("camera_info", camera)
     client.spin(0.3)
-    client.listen(Image, "gap_mask", qos=RELIABLE.__class__(depth=4, reliability=2))
+    for topic in ("gap_mask", "segmentation_node/overlay"):
+        client.listen(Image, topic, qos=QoSProfile(depth=4, reliability=ReliabilityPolicy.BEST_EFFORT))
     client.spin(0.5)
     send(client, image_message(frames[0], 10**18))
     client.spin_until(lambda: bool(client.received["gap_mask"]))
+    client.spin_until(lambda: bool(client.received["segmentation_node/overlay"]))
+    overlay = client.received["segmentation_node/overlay"][0]
+    drawn = np.frombuffer(overlay.data, np.uint8).reshape(frames[0].shape)
+    assert 0.001 < (drawn != frames[0]).any(axis=2).mean() < 0.3
     mask = client.received["gap_mask"][0]
     pixels = np.frombuffer(mask.data, np.uint8).reshape(mask.height, mask.width)
     assert (mask.width, mask.height, mask.encoding) == (1280, 720, "mono8")

@@ -8,7 +8,8 @@ from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages import image_from_compressed, image_from_message, stamp_ns
+from knee_gap_perception.messages import Image, image_from_compressed, image_from_message, stamp_ns
+from knee_gap_perception.overlay import draw_overlay
 
 NO_CAMERA = "no camera_info received yet"
 
@@ -21,6 +22,7 @@ class EdgeStream:
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
         self.reason = "no image received yet"
+        self._image: Image | None = None
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
         self._camera_key: tuple[object, ...] = ()
@@ -44,6 +46,7 @@ class EdgeStream:
         try:
             is_compressed = hasattr(message, "format")
             image = image_from_compressed(message) if is_compressed else image_from_message(message)
+            self._image = image
             if self._camera is None:
                 raise PerceptionError(self._camera_flaw)
             edges = self.detector.process(stamp, image, self._camera, frame_id=frame_id)
@@ -55,3 +58,10 @@ class EdgeStream:
         self.latest = edges
         self.counts[edges.status.name] += 1
         return edges
+
+    def overlay(self) -> Image | None:
+        """The last image with all that was found drawn on it; None before the first."""
+        if self._image is None or self.latest is None:
+            return None
+        mask = self.detector.gap_mask()
+        return draw_overlay(self._image, self.latest, mask, self.reason, self._camera)

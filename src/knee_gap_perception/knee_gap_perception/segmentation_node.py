@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 from geometry_msgs.msg import PointStamped
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from knee_gap_msgs.msg import GapEdges
@@ -16,7 +18,7 @@ from knee_gap_perception.segmentation_parameters import TransportParameters
 
 
 class SegmentationNode(BaseNode):
-    """Converts, calls the core, publishes; the mask is computed only while somebody listens."""
+    """Converts, calls the core, publishes; mask and overlay are made only while somebody listens."""
 
     def __init__(self) -> None:
         super().__init__("segmentation_node", health=self.health)
@@ -27,6 +29,7 @@ class SegmentationNode(BaseNode):
         self._sequence: int | None = None
         self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)
         self._mask = self.create_publisher(Image, "gap_mask", IMAGE_QOS)
+        self._overlay = self.create_publisher(Image, "~/overlay", IMAGE_QOS)
         kind, topic = {
             "raw": (Image, "image_raw"),
             "compressed": (CompressedImage, "image_raw/compressed"),
@@ -36,26 +39,37 @@ class SegmentationNode(BaseNode):
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
 
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
-        """Publish the edges in an image, and the mask if anybody wants it."""
+        """Publish the edges in an image, and the pictures that anybody wants."""
         self.count_dropped(info.get("publication_sequence_number"))
         edges = self._stream.on_image(message)
         self._edges.publish(fill_gap_edges(GapEdges(), edges))
         if self._stream.reason:
             self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
         if self._mask.get_subscription_count():
-            self.publish_mask(message)
+            self.publish_picture(self._mask, self._stream.detector.gap_mask(), "mono8", message)
+        if self._overlay.get_subscription_count():
+            overlay = self._stream.overlay()
+            if overlay is not None:
+                self.publish_picture(self._overlay, overlay, "bgr8", message)
 
     def on_click(self, message: PointStamped) -> None:
         """Choose the section of the gap nearest to a pixel (x column, y row) of the next image."""
         self._stream.detector.choose_at(np.array([message.point.x, message.point.y]))
 
-    def publish_mask(self, image: Image | CompressedImage) -> None:
-        """Publish the gap of the last image as mono8, 255 where it is."""
-        mask = self._stream.detector.gap_mask()
-        message = Image(header=image.header, height=mask.shape[0], width=mask.shape[1], encoding="mono8")
-        message.step = mask.shape[1]
-        message.data = mask.tobytes()
-        self._mask.publish(message)
+    def publish_picture(
+        self,
+        publisher: Publisher,
+        picture: npt.NDArray[np.uint8],
+        encoding: str,
+        image: Image | CompressedImage,
+    ) -> None:
+        """Publish what was made of an image, with that image's header."""
+        message = Image(
+            header=image.header, height=picture.shape[0], width=picture.shape[1], encoding=encoding
+        )
+        message.step = picture.strides[0]
+        message.data = picture.tobytes()
+        publisher.publish(message)
 
     def count_dropped(self, number: int | None) -> None:
         """Count the images that the middleware skipped because newer ones were waiting."""
