@@ -88,7 +88,7 @@ def stamp_of(message: Any) -> int:
 
 def draw_contact_sheet(bag: Path, edges: dict[int, Any], path: Path) -> None:
     """Every sixth image with the points and the status that were published for it."""
-    tiles = []
+    tiles: list[Any] = []
     with BagReader(bag) as reader:
         for k, entry in enumerate(reader.messages([IMAGE])):
             message = reader.deserialize(entry)
