@@ -2,6 +2,7 @@
 
 import select
 import socket
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -69,6 +70,8 @@ class NatNetParameters:
 class NatNetClient:
     """Receives frames from Motive; a `BodySource`. Never blocks for longer than asked to.
 
+    One thread may poll while another asks for the status.
+
     `ros_now` gives the time of ROS [ns]; stamps follow it when it steps. `up_axis` is that of Motive's
     stream. Raises PerceptionError for an address that is none or that this machine does not have.
     """
@@ -90,6 +93,8 @@ class NatNetClient:
         self._data: socket.socket | None = None
         self._group: tuple[str, int] | None = None
         self._send_fault = ""
+        # One thread receives, another asks how it fares.
+        self._lock = threading.Lock()
         if self.parameters.transmission == "multicast":
             self._join((self.parameters.multicast_address, self.parameters.data_port))
 
@@ -115,7 +120,8 @@ class NatNetClient:
 
     def status(self) -> SourceStatus:
         """Return how the connection fares, in plain words."""
-        status = self.session.status(time.monotonic_ns())
+        with self._lock:
+            status = self.session.status(time.monotonic_ns())
         if self._send_fault and not status.ok:
             return SourceStatus(False, f"{status.words}; sending fails: {self._send_fault}", status.values)
         return status
@@ -127,7 +133,9 @@ class NatNetClient:
             self._data.close()
 
     def _send_due(self) -> None:
-        for request in self.session.outgoing(time.monotonic_ns()):
+        with self._lock:
+            requests = self.session.outgoing(time.monotonic_ns())
+        for request in requests:
             try:
                 self._command.sendto(request, self._server)
                 self._send_fault = ""
@@ -149,7 +157,9 @@ class NatNetClient:
                     # On Linux a request to a closed port fails the next read; the session retries.
                     continue
                 arrival_ns = time.monotonic_ns()
-                frame = self.session.receive(data, sender, arrival_ns, self._ros_offset_ns())
+                offset_ns = self._ros_offset_ns()
+                with self._lock:
+                    frame = self.session.receive(data, sender, arrival_ns, offset_ns)
                 if frame is not None:
                     frames.append(frame)
         self._follow_transmission()
