@@ -1,7 +1,7 @@
 """Rewrite the builder's include paths in ROS's wheels to those of this interpreter.
 
-The wheels' exported CMake targets name the Python and numpy headers of the machine that compiled them, and CMake
-refuses to configure against folders that do not exist.
+The wheels' exported CMake targets name the Python and numpy headers of the machine that compiled them, and
+CMake refuses to configure against folders that do not exist.
 """
 
 import re
