@@ -31,17 +31,26 @@ def sources_digest(module: str) -> str:
     return sha256(b"".join(path.read_bytes() for path in sorted(sources(module)))).hexdigest()[:12]
 
 
-def compiled(function: Callable[..., Any] | None = None, *, fastmath: bool = False) -> Any:
+def compiled(
+    function: Callable[..., Any] | None = None, *, fastmath: bool = False, inlined: bool = False
+) -> Any:
     """Decorate a function to be compiled by numba at its first call and kept on disk for the next process.
 
     numba renews a cached function only when its own file changes, although it holds the code of all the
     functions it calls; with the digest of all sources in its name, an edit of any of them renews it. Where
     nothing is writable the function is compiled anew in each process.
+
+    `fastmath` lets sums be reordered; `inlined` copies the function into its callers, for the innermost ones
+    that are handed many arrays.
     """
     if function is None:
-        return lambda decorated: compiled(decorated, fastmath=fastmath)
+        return lambda decorated: compiled(decorated, fastmath=fastmath, inlined=inlined)
     function.__qualname__ += f"_{sources_digest(Path(function.__code__.co_filename).stem)}"
-    options: dict[str, Any] = {"error_model": "numpy", "fastmath": FAST if fastmath else False}
+    options: dict[str, Any] = {
+        "error_model": "numpy",
+        "fastmath": FAST if fastmath else False,
+        "inline": "always" if inlined else "never",
+    }
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:

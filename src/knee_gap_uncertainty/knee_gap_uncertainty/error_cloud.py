@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from knee_gap_uncertainty.angle_sets import SIGNS, Signs, perturbed_angles
 from knee_gap_uncertainty.compiled import compiled
-from knee_gap_uncertainty.errors import ParallelToTravelError
+from knee_gap_uncertainty.errors import BadInputError, ParallelToTravelError
 from knee_gap_uncertainty.slices import places_by_inverse
 from knee_gap_uncertainty.translation_volume import displaced_travel, displacements
 from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE, ray_length, triangle_angles
@@ -22,8 +22,7 @@ from knee_gap_uncertainty.vectors import Vector, add, cross, norm, row, scale, u
 
 Apex: TypeAlias = Literal["first", "second"]
 
-# Rotations phi of Delta g about the ray, each taken both ways: eight spokes of a ring of points about the
-# ray.
+# Rotations phi of Delta g about the ray, each taken both ways: eight points a ring.
 PHI = (0.0, math.pi / 6, math.pi / 4, math.pi / 2)
 COS_PHI = np.cos(PHI)
 SIN_PHI = np.sin(PHI)
@@ -39,8 +38,8 @@ class ErrorCloud(NamedTuple):
 
     `points` (3, 8, rings): coordinates, spokes, rings, coarsely in order of length; `starts`: where the
     slices of each spoke begin, with the end of the last. `far` (3, 8, more): rings for rays that do not meet,
-    drawn at a great distance. `smallest_angle`: least angle alpha', beta' or pi less one of them [rad]; not
-    above zero where there is no triangle.
+    drawn at a great distance. `smallest_angle`: least angle alpha', beta' or pi less one of them [rad];
+    where it leaves no triangle, the cloud is empty.
     """
 
     points: npt.NDArray[np.float64]
@@ -63,6 +62,9 @@ def trace_cloud(
     `travel` leads from the ray's own lens to the other one; `other` is the bearing from there.
     """
     lengths, smallest_angle = ring_lengths(travel, own, other, angular_error, shifts, signs)
+    if not smallest_angle > SMALLEST_ANGLE:
+        nothing = np.empty((3, SPOKES, 0))
+        return ErrorCloud(nothing, np.zeros(1, np.int64), nothing, smallest_angle)
     places, starts = places_by_inverse(lengths[lengths < math.inf])
     points = np.empty((3, SPOKES, places.size))
     far = np.empty((3, SPOKES, lengths.size - places.size))
@@ -150,6 +152,10 @@ def error_clouds(
     Only places at a finite distance are listed. Raises ParallelToTravelError where an admitted error turns a
     bearing into the direction of travel.
     """
+    if signs not in SIGNS or apex not in ("first", "second"):
+        raise BadInputError(
+            f"signs must be one of {', '.join(SIGNS)} and apex first or second, got {signs}, {apex}"
+        )
     first = apex == "first"
     travel = vector(views.travel if first else -views.travel)
     lens = views.lens_0 if first else views.lens_1

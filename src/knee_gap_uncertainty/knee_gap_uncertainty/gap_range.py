@@ -14,7 +14,7 @@ from knee_gap_uncertainty.extremes import extremes
 from knee_gap_uncertainty.overlap import hulls_meet
 from knee_gap_uncertainty.slices import slice_spokes
 from knee_gap_uncertainty.translation_volume import displacements
-from knee_gap_uncertainty.triangulation import triangulate
+from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE, triangulate
 from knee_gap_uncertainty.two_views import TwoViews, two_views
 from knee_gap_uncertainty.vectors import row, subtract, vector
 
@@ -117,20 +117,14 @@ def cloud_range(
     cloud_0 = trace_cloud(t, row(own, 0), row(other, 0), angular_error, shifts, signs)
     cloud_1 = trace_cloud(t, row(own, 1), row(other, 1), angular_error, shifts, signs)
     smallest_angle = min(cloud_0.smallest_angle, cloud_1.smallest_angle)
-    if not smallest_angle > 0.0:
+    if not smallest_angle > SMALLEST_ANGLE:
         return math.nan, math.nan, smallest_angle
-    one, other_one = (
-        slice_spokes(cloud_0.points, cloud_0.starts),
-        slice_spokes(cloud_1.points, cloud_1.starts),
-    )
-    far_0, far_1 = (
-        cloud_0.far.reshape(3, cloud_0.far.size // 3),
-        cloud_1.far.reshape(3, cloud_1.far.size // 3),
-    )
-    nearest, farthest = extremes(one, other_one)
-    if hulls_meet(one, far_0, other_one, far_1, subtract(row(own, 0), row(own, 1))):
+    sliced_0 = slice_spokes(cloud_0.points, cloud_0.starts)
+    sliced_1 = slice_spokes(cloud_1.points, cloud_1.starts)
+    nearest, farthest = extremes(sliced_0, sliced_1)
+    if hulls_meet(sliced_0, cloud_0.far, sliced_1, cloud_1.far, subtract(row(own, 0), row(own, 1))):
         nearest = 0.0
-    if far_0.size + far_1.size > 0:
+    if cloud_0.far.size + cloud_1.far.size > 0:
         farthest = math.inf
     return nearest, farthest, smallest_angle
 

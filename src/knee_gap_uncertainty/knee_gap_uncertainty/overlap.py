@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.compiled import compiled
-from knee_gap_uncertainty.slices import SlicedCloud
+from knee_gap_uncertainty.slices import Boxes, SlicedCloud
 from knee_gap_uncertainty.vectors import Vector, add, column, cross, dot, norm, row, scale, subtract
 
 # Hulls closer than this share of their extent touch. The search takes about ten steps; one that does not end,
@@ -29,7 +29,7 @@ def hulls_meet(
     other_far: npt.NDArray[np.float64],
     guess: Vector,
 ) -> bool:
-    """Whether the convex hulls of two clouds, each with its far points (3, n), have a point in common.
+    """Whether the convex hulls of two clouds, each with its far points (3, 8, n), have a point in common.
 
     `guess` is a direction from the other cloud to this one, tried first as normal of a plane between them.
     """
@@ -57,24 +57,25 @@ def extreme_point(cloud: SlicedCloud, far: npt.NDArray[np.float64], direction: V
     best = -math.inf
     found = (0.0, 0.0, 0.0)
     for i in range(cloud.starts.size - 1):
-        if reach(cloud.low, cloud.high, i, direction) > best:
+        if reach(cloud.slices, i, direction) > best:
             for j in range(cloud.starts[i], cloud.starts[i + 1]):
                 point = column(cloud.points, j)
                 if dot(point, direction) > best:
                     best, found = dot(point, direction), point
-    for j in range(far.shape[1]):
-        point = column(far, j)
-        if dot(point, direction) > best:
-            best, found = dot(point, direction), point
+    for spoke in range(far.shape[1]):
+        for j in range(far.shape[2]):
+            point = (far[0, spoke, j], far[1, spoke, j], far[2, spoke, j])
+            if dot(point, direction) > best:
+                best, found = dot(point, direction), point
     return found
 
 
 @compiled
-def reach(low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], i: int, direction: Vector) -> float:
+def reach(boxes: Boxes, i: int, direction: Vector) -> float:
     """How far box i extends in the direction: no point in it lies farther."""
     total = 0.0
     for axis in range(3):
-        total += max(low[axis, i] * direction[axis], high[axis, i] * direction[axis])
+        total += max(boxes.low[axis, i] * direction[axis], boxes.high[axis, i] * direction[axis])
     return total
 
 

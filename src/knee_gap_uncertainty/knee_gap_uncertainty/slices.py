@@ -18,21 +18,25 @@ SLICES = 2.5
 GROUP = 8
 
 
-class SlicedCloud(NamedTuple):
-    """A cloud sorted into boxes; corners are (3, count).
+class Boxes(NamedTuple):
+    """Boxes along the axes: their least and greatest corners (3, count)."""
 
-    `points` (3, n): slice i holds the columns `starts[i]` to `starts[i + 1]`, all between `low[:, i]` and
-    `high[:, i]`. Group j holds the slices `group_starts[j]` to `group_starts[j + 1]`, between `group_low` and
-    `group_high`.
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+
+
+class SlicedCloud(NamedTuple):
+    """A cloud in slices, and the slices in groups, each with its box.
+
+    `points` (3, n): slice i holds the columns `starts[i]` to `starts[i + 1]`, all within box i of `slices`.
+    Group j holds the slices `group_starts[j]` to `group_starts[j + 1]`, all within box j of `groups`.
     """
 
     points: npt.NDArray[np.float64]
     starts: npt.NDArray[np.int64]
-    low: npt.NDArray[np.float64]
-    high: npt.NDArray[np.float64]
+    slices: Boxes
     group_starts: npt.NDArray[np.int64]
-    group_low: npt.NDArray[np.float64]
-    group_high: npt.NDArray[np.float64]
+    groups: Boxes
 
 
 @compiled
@@ -61,35 +65,44 @@ def places_by_inverse(
     return places, np.unique(ends)
 
 
-@compiled(fastmath=True)
-def boxes(
-    columns: npt.NDArray[np.float64], starts: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Least and greatest coordinates (3, count) of the columns between successive starts."""
-    count = starts.size - 1
-    low, high = np.empty((3, count)), np.empty((3, count))
-    for axis in range(3):
-        row = columns[axis]
-        for i in range(count):
-            least = most = row[starts[i]]
-            for j in range(starts[i] + 1, starts[i + 1]):
-                least = min(least, row[j])
-                most = max(most, row[j])
-            low[axis, i], high[axis, i] = least, most
-    return low, high
-
-
 @compiled
 def slice_spokes(points: npt.NDArray[np.float64], starts: npt.NDArray[np.int64]) -> SlicedCloud:
     """Box the slices of points (3, spokes, n): the same `starts`, from 0 to n, for every spoke."""
-    spokes, slices = points.shape[1], starts.size - 1
+    spokes, count = points.shape[1], starts.size - 1
     columns = points.reshape(3, spokes * points.shape[2])
     slice_starts = repeat_starts(starts, spokes)
-    low, high = boxes(columns, slice_starts)
-    group_starts = repeat_starts(np.append(np.arange(0, slices, GROUP), slices), spokes)
-    group_low, _ = boxes(low, group_starts)
-    _, group_high = boxes(high, group_starts)
-    return SlicedCloud(columns, slice_starts, low, high, group_starts, group_low, group_high)
+    slices = Boxes(lowest(columns, slice_starts), highest(columns, slice_starts))
+    group_starts = repeat_starts(np.append(np.arange(0, count, GROUP), count), spokes)
+    groups = Boxes(lowest(slices.low, group_starts), highest(slices.high, group_starts))
+    return SlicedCloud(columns, slice_starts, slices, group_starts, groups)
+
+
+@compiled(fastmath=True)
+def lowest(columns: npt.NDArray[np.float64], starts: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Least coordinates (3, count) of the columns between successive starts."""
+    low = np.empty((3, starts.size - 1))
+    for axis in range(3):
+        along = columns[axis]
+        for i in range(starts.size - 1):
+            least = along[starts[i]]
+            for j in range(starts[i] + 1, starts[i + 1]):
+                least = min(least, along[j])
+            low[axis, i] = least
+    return low
+
+
+@compiled(fastmath=True)
+def highest(columns: npt.NDArray[np.float64], starts: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Greatest coordinates (3, count) of the columns between successive starts."""
+    high = np.empty((3, starts.size - 1))
+    for axis in range(3):
+        along = columns[axis]
+        for i in range(starts.size - 1):
+            most = along[starts[i]]
+            for j in range(starts[i] + 1, starts[i + 1]):
+                most = max(most, along[j])
+            high[axis, i] = most
+    return high
 
 
 @compiled

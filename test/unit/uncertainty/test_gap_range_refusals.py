@@ -120,6 +120,20 @@ def test_a_bearing_that_the_error_turns_into_the_travel(apex):
         error_clouds(two_views(**nearly), **ERRORS, signs="opposite", apex=apex)
 
 
+def test_a_bearing_at_exactly_the_error_beside_the_travel():
+    """The perturbed angle is zero, and so is the ray: refused before anything is divided by it."""
+    nearly = look([[0.0, 0.001, DEPTH], [0.0, 0.004, DEPTH]], [0.0, 0.0, 0.009])
+    alpha = math.atan2(0.001, DEPTH)
+    for error in (alpha, np.nextafter(alpha, 0), np.nextafter(alpha, 1), alpha - 1e-12, alpha + 1e-12):
+        with pytest.raises(ParallelToTravelError):
+            gap_range(**nearly, angular_error=error, translation_error=0.0, apex="best")
+
+
+def test_a_choice_of_signs_that_is_none():
+    with pytest.raises(BadInputError, match="signs must be one of none, same, opposite, all"):
+        error_clouds(two_views(**GOOD), **ERRORS, signs="both")
+
+
 @pytest.mark.parametrize("interval", ["paper", "worst_case"])
 def test_rays_that_meet_behind(interval):
     swapped = GOOD | {"lens_0": GOOD["lens_1"], "lens_1": GOOD["lens_0"]}

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from knee_gap_uncertainty.overlap import hulls_meet
 from knee_gap_uncertainty.slices import slice_spokes
 
-NONE = np.empty((3, 0))
+NONE = np.empty((3, 1, 0))
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 
 
@@ -69,5 +69,5 @@ def test_flat_clouds():
 def test_far_points_carry_a_hull_on():
     away = CUBE + np.array([10.0, 0.0, 0.0])
     assert not meet(CUBE, away)
-    assert meet(CUBE, away, one_far=np.array([[100.0], [0.5], [0.5]]))
-    assert not meet(CUBE, away, one_far=np.array([[0.5], [100.0], [0.5]]))
+    assert meet(CUBE, away, one_far=np.array([[[100.0]], [[0.5]], [[0.5]]]))
+    assert not meet(CUBE, away, one_far=np.array([[[0.5]], [[100.0]], [[0.5]]]))
