@@ -9,10 +9,11 @@ from std_msgs.msg import Float64
 
 from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice
 from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
-from knee_gap_uncertainty import gap_estimate, gap_range, messages, multi_view
+from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.motion_advice import AdviceParameters
+from knee_gap_uncertainty.warm_up import warm_up
 
 # A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
 GAP_DEADLINE = Duration(nanoseconds=100_000_000)
@@ -29,8 +30,7 @@ class UncertaintyNode(BaseNode):
         self._estimator = GapEstimator(self.declare(EstimatorParameters), self._advice_parameters)
         self.refuse_unknown_parameters()
         # Compiled before the first image, so that its estimate is not late.
-        gap_range.warm_up()
-        multi_view.warm_up()
+        warm_up()
         gap_qos = QoSProfile(
             depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=GAP_DEADLINE
         )
