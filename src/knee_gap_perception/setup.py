@@ -18,6 +18,8 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
+            "calibrate = knee_gap_perception.calibration.command:main",
+            "evaluate = knee_gap_perception.evaluate:main",
             "segmentation_node = knee_gap_perception.segmentation_node:main",
             "tracker_precision = knee_gap_perception.tracker_precision_command:main",
             "tracking_node = knee_gap_perception.tracking_node:main",

@@ -160,7 +160,8 @@ def _refined(grey: npt.NDArray[np.uint8], corners: Any, points: Array, clear: fl
     np.fill_diagonal(apart_px, np.inf)
     np.fill_diagonal(apart, np.inf)
     nearest, row = apart.argmin(axis=1), np.arange(len(points))
-    half_px = np.clip(apart_px[row, nearest] / apart[row, nearest] * clear, 2, 11).astype(int)
+    scale = apart_px[row, nearest] / apart[row, nearest]
+    half_px = np.clip(0.75 * scale * clear, 2, 11).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
     refined = np.array(corners, dtype=np.float32)
     for half in np.unique(half_px):

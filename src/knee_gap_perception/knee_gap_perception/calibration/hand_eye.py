@@ -30,7 +30,7 @@ from knee_gap_perception.calibration.hand_eye_bundle import (
     TrackedView,
     tracker_sigma,
 )
-from knee_gap_perception.calibration.intrinsics import Intrinsics, board_pose
+from knee_gap_perception.calibration.intrinsics import SYSTEMATIC_PX, Intrinsics, board_pose, systematic
 from knee_gap_perception.calibration.lens_model import LensModel
 from knee_gap_perception.calibration.rigid import (
     Array,
@@ -50,7 +50,6 @@ MIN_SCOPE_TURN = np.radians(20.0)  # spread of scope turns from which the shaft'
 TRANSLATION_ERROR = 0.0367e-3
 ROTATION_ERROR = np.radians(0.004)
 START_SCALE = 5.0
-SYSTEMATIC_PX = 0.05  # bias of corner detection: blur, perspective within the window, shading
 SYSTEMATIC_DEPTHS = (
     2.0  # a bias that grows over the picture moves the lens by this many times angle x distance
 )
@@ -292,17 +291,17 @@ def _result(
     covariance = max(1.0, chi_square) * np.linalg.inv(information)
     if not bundle.free_lens:
         covariance = covariance + _considered(bundle, linear, blocks, information, intrinsics.covariance)
-    sigma = np.sqrt(np.diag(covariance))
+    sigma, floor = np.sqrt(np.diag(covariance)), _systematic(bundle, state)
     squares = (
         np.concatenate([x.residual + x.by_error @ -e for x, e in zip(linear, state.errors, strict=True)]) ** 2
     )
     return HandEye(
         T_body_lens=state.T_body_lens,
-        covariance=covariance[:6, :6] + _systematic(bundle, state),
+        covariance=covariance[:6, :6] + floor,
         T_world_board=state.T_world_board,
         intrinsics=_refined_intrinsics(bundle, state, intrinsics, covariance),
         axis=state.axis,
-        axis_sigma=(float(sigma[-4:-2].max()), float(sigma[-2:].max())) if bundle.has_axis else None,
+        axis_sigma=_axis_sigma(sigma, floor) if bundle.has_axis else None,
         time_offset=state.time_offset,
         time_offset_sigma=float(sigma[-5 if bundle.has_axis else -1]) if bundle.timed else np.nan,
         rotation_error=float(bundle.pose_sigma[0] * np.sqrt(3)),
@@ -316,12 +315,17 @@ def _result(
 
 def _systematic(bundle: HandEyeBundle, state: HandEyeState) -> Array:
     """Covariance (6, 6) of what no residual shows: a bias of the found points that is alike in all views."""
-    distances = [
-        float(np.linalg.norm(board_pose(v.board, state.lens, bundle.model)[:3, 3])) for v in bundle.views
-    ]
+    poses = [board_pose(view.board, state.lens, bundle.model) for view in bundle.views]
+    distance = float(np.median([np.linalg.norm(T_lens_board[:3, 3]) for T_lens_board in poses]))
     angle = SYSTEMATIC_PX / float(state.lens[0])
-    shift = SYSTEMATIC_DEPTHS * angle * float(np.median(distances))
+    shift = SYSTEMATIC_DEPTHS * angle * distance
     return np.diag(np.repeat([angle**2, shift**2], 3))
+
+
+def _axis_sigma(sigma: Array, floor: Array) -> tuple[float, float]:
+    """Standard deviations of the axis: tilt [rad] and shift [m], the larger of two each, with the floor's."""
+    tilt, shift = float(sigma[-4:-2].max()), float(sigma[-2:].max())
+    return float(np.hypot(tilt, np.sqrt(floor[0, 0]))), float(np.hypot(shift, np.sqrt(floor[3, 3])))
 
 
 def _considered(
@@ -349,6 +353,7 @@ def _refined_intrinsics(
     free = bundle.model.free
     lens = np.zeros((len(free), len(free)))
     lens[np.ix_(free, free)] = covariance[12 : 12 + free.sum(), 12 : 12 + free.sum()]
+    lens += systematic(len(free))
     fx, fy, cx, cy = (float(value) for value in state.lens[:4])
     k = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
     return replace(intrinsics, k=k, d=tuple(map(float, state.lens[4:])), covariance=lens)

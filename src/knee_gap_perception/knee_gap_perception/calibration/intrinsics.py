@@ -15,6 +15,7 @@ from knee_gap_perception.calibration.boards import MIN_POINTS, BoardView
 from knee_gap_perception.calibration.bundle import Block, block, minimise
 from knee_gap_perception.calibration.lens_model import LensModel
 from knee_gap_perception.calibration.rigid import Array, apply, from_vector, skew
+from knee_gap_perception.camera import MODELS, Camera
 from knee_gap_perception.errors import PerceptionError
 
 MIN_VIEWS = 4
@@ -24,6 +25,7 @@ MIN_TILT = np.radians(
 MIN_COVERAGE = 0.25  # of the picture's height and width that the points must span
 OUTLIER_SIGMAS = 5.0
 OUTLIER_FLOOR_PX = 0.3
+SYSTEMATIC_PX = 0.05  # bias of corner detection, alike in all views: blur, perspective in the window, shading
 CORRELATION_RANGE = 8  # spacings of the points over which their errors may agree
 
 
@@ -53,6 +55,11 @@ class Intrinsics:
     def parameters(self) -> Array:
         """fx, fy, cx, cy and the distortion (m,)."""
         return np.array([self.k[0], self.k[4], self.k[2], self.k[5], *self.d])
+
+    def camera(self) -> Camera:
+        """The camera model that measures with this lens."""
+        fx, fy, cx, cy = (float(value) for value in self.parameters[:4])
+        return MODELS[self.distortion_model](self.width, self.height, fx, fy, cx, cy, self.d)
 
 
 @dataclass(frozen=True)
@@ -259,6 +266,7 @@ def _result(
     variance = squares.sum() / freedom
     covariance = np.zeros((len(parameters), len(parameters)))
     covariance[np.ix_(model.free, model.free)] = effect * variance * np.linalg.inv(information)
+    covariance += systematic(len(parameters))
     fx, fy, cx, cy = (float(value) for value in parameters[:4])
     distortion = list(map(float, parameters[4:]))
     intrinsics = Intrinsics(
@@ -275,6 +283,14 @@ def _result(
         point_count=int(points.sum()),
     )
     return IntrinsicsFit(intrinsics, tuple(views), poses, np.sqrt(squares / points), dropped)
+
+
+def systematic(parameter_count: int) -> Array:
+    """Covariance (m, m) of the lens from what no residual shows: a bias of points, alike in all views."""
+    sigma = np.zeros(parameter_count)
+    # Half the field of view is about half a radian: a bias there moves the focal length by twice as much.
+    sigma[:4] = 2 * SYSTEMATIC_PX, 2 * SYSTEMATIC_PX, SYSTEMATIC_PX, SYSTEMATIC_PX
+    return np.diag(sigma**2)
 
 
 def design_effect(views: Sequence[BoardView], residuals: Sequence[Array]) -> float:

@@ -15,6 +15,8 @@ from knee_gap_perception.errors import PerceptionError
 MIN_POSES = 30
 MIN_TURN = np.radians(4.0)  # RMS rotation about each of two axes
 OUTLIER_SIGMAS = 4.0
+UNKNOWNS = 6  # of tip and pivot together
+BLOCK_POSES = 100
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,12 @@ def _solve(T: Array) -> Array:
 
 def _result(T: Array, solution: Array, residual: Array, outliers: int) -> Pivot:
     """Covariance by blocks of poses: what holds the tip badly lasts longer than one sample."""
-    blocks = np.array_split(np.arange(len(T)), min(len(T), max(6, len(T) // 30)))
+    blocks = np.array_split(np.arange(len(T)), min(len(T), int(np.clip(len(T) // BLOCK_POSES, 8, 40))))
     design = np.concatenate([T[:, :3, :3], np.broadcast_to(-np.eye(3), (len(T), 3, 3))], axis=2)
     information = np.einsum("nki,nkj->ij", design, design)
     scores = np.array([np.einsum("nki,nk->i", design[b], residual[b]) for b in blocks])
     bread = np.linalg.inv(information)
-    covariance = bread @ (scores.T @ scores * len(blocks) / (len(blocks) - 2)) @ bread
+    covariance = bread @ (scores.T @ scores * len(blocks) / (len(blocks) - UNKNOWNS)) @ bread
     return Pivot(
         tip=solution[:3],
         covariance=covariance[:3, :3],

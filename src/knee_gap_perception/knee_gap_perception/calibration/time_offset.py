@@ -23,7 +23,9 @@ WINDOW = 2.0  # [s] for one regression
 MIN_PAIRS = 40  # in a window: its 18 coefficients would fit fewer too well
 DEGREES = (1, 2)  # of the coefficients' change with time
 MIN_WINDOWS = 5
-MIN_EXPLAINED = 0.5  # share of the flow's variance that the tracked motion must explain
+MIN_LEAD = (
+    3.0  # how much less must be left at the best offset than at most others; unrelated motion gives 1.2
+)
 SCAN_STEP = 0.004  # [s]
 
 
@@ -68,12 +70,14 @@ def estimate_time_offset(motion: ImageMotion, track: PoseTrack, *, max_offset: f
     residuals = residuals.weighted(float(steps[coarse.argmin()]))
     scan = np.array([residuals(step).sum() for step in steps]) / residuals.total
     best = int(scan.argmin())
-    if scan[best] > 1 - MIN_EXPLAINED:
+    lead = float(np.median(scan) / scan[best])
+    if lead < MIN_LEAD:
         raise PerceptionError(
-            f"the tracked motion explains {100 * (1 - scan[best]):.0f} % of the picture's motion; at least "
-            f"{100 * MIN_EXPLAINED:.0f} % are needed: move the scope more, to and fro about once a second, "
-            "and look at "
-            "something that stands still"
+            f"the picture's motion fits the tracked one at {1e3 * steps[best]:+.0f} ms only {lead:.1f} "
+            "times better than at "
+            f"other offsets; at least {MIN_LEAD:g} times are needed: shake the scope more, two or three "
+            "times a second, "
+            "and look at something that stands still"
         )
     if best in (0, len(steps) - 1):
         raise PerceptionError(

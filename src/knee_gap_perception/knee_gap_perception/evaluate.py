@@ -1,0 +1,281 @@
+"""`evaluate`: predicted masks of the gap against marked ones (the paper's II-E, Table 2 and figure 8)."""
+
+import argparse
+import csv
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from knee_gap_perception.calibration.bag_input import CalibrationBag
+from knee_gap_perception.calibration.calibration_file import load_calibration
+from knee_gap_perception.camera import Camera, EquiangularCamera
+from knee_gap_perception.difference_picture import difference_picture, panel
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.field_of_view import FieldOfViewFinder
+from knee_gap_perception.image_error import EdgeError, Mask, Overlap, edge_error, overlap, rms
+from knee_gap_perception.segmentation.choice import segmentation_named
+
+Image = npt.NDArray[np.uint8]
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+SHEET_ROWS = 8
+
+
+class Pair(NamedTuple):
+    """A predicted and a marked mask (h, w), the set and name they go by, and the picture if there is one."""
+
+    image_set: str
+    name: str
+    predicted: Mask
+    marked: Mask
+    picture: Image | None
+
+
+class Row(NamedTuple):
+    """What one pair came to."""
+
+    image_set: str
+    name: str
+    overlap: Overlap
+    error: EdgeError | None
+
+
+def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[int, Iterator[Pair]]:
+    """Masks of two folders with the same name but for the suffix; a subfolder is a set of its own.
+
+    Raises PerceptionError for folders that are missing or share no name, and for files that are no images.
+    """
+    predictions, marks = _files(predicted), _files(marked)
+    views = _files(pictures) if pictures else {}
+    names = sorted(predictions.keys() & marks.keys())
+    if not names:
+        raise PerceptionError(f"no mask in {predicted} has the name of one in {marked}")
+    if unpaired := len(predictions.keys() ^ marks.keys()):
+        print(f"evaluate: {unpaired} masks have no partner and are left out", file=sys.stderr)
+
+    def pairs() -> Iterator[Pair]:
+        for name in names:
+            view = _image(views[name]) if name in views else None
+            folder = name.parent.as_posix()
+            label = "all" if folder == "." else folder
+            yield Pair(label, name.name, _mask(predictions[name]), _mask(marks[name]), view)
+
+    return len(names), pairs()
+
+
+def bag_pairs(
+    bag: Path, image_topic: str, truth_topic: str, mask_topic: str | None, segmentation: str
+) -> tuple[int, Iterator[Pair]]:
+    """Masks of a bag with truth, predicted by a recorded topic or else by a segmentation run on the images.
+
+    Raises PerceptionError for topics that are not in the bag and for stamps that have no partner.
+    """
+    source = CalibrationBag(bag)
+    truth = {stamp: image[..., 0] > 127 for stamp, image in source.images(truth_topic)}
+
+    def predictions() -> Iterator[tuple[int, Mask, Image | None]]:
+        if mask_topic is not None:
+            yield from ((stamp, image[..., 0] > 127, None) for stamp, image in source.images(mask_topic))
+            return
+        segment, finder = segmentation_named(segmentation), FieldOfViewFinder()
+        for stamp, image in source.images(image_topic):
+            if stamp in truth and (field := finder.find(image)) is not None:
+                yield stamp, np.asarray(segment(image, field.mask(image.shape[:2])), dtype=bool), image  # type: ignore[arg-type]
+
+    pairs = (
+        Pair(bag.stem, str(stamp), mask, truth[stamp], picture)
+        for stamp, mask, picture in predictions()
+        if stamp in truth
+    )
+    return len(truth), pairs
+
+
+def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Row]:
+    """Judge every pair; write its difference picture, and a sheet of the first of each set, into a folder.
+
+    Without a camera the paper's equiangular one of 90 by 90 degrees is taken, at each image's size.
+    """
+    rows: list[Row] = []
+    sheet: list[Image] = []
+    for pair in pairs:
+        height, width = pair.marked.shape
+        lens = camera or EquiangularCamera(width, height)
+        error = edge_error(pair.predicted, pair.marked, lens)
+        rows.append(Row(pair.image_set, pair.name, overlap(pair.predicted, pair.marked), error))
+        difference = difference_picture(pair.predicted, pair.marked, error)
+        folder = out / "difference" / pair.image_set
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"{pair.name}.png"), difference)
+        if sum(row.image_set == pair.image_set for row in rows) <= SHEET_ROWS:
+            pictures = [] if pair.picture is None else [pair.picture]
+            sheet.append(
+                panel(f"{pair.image_set} {pair.name}", [*pictures, pair.marked, pair.predicted, difference])
+            )
+    if not rows:
+        raise PerceptionError("no predicted mask has the stamp of a true one")
+    _write_sheet(sheet, out / "sheet.png")
+    return rows
+
+
+def table(rows: Sequence[Row]) -> list[dict[str, float | str | int]]:
+    """The rows of Table 2: each set, and all of them: Dice, RMS errors at G0 and G1 and their average."""
+    sets = list(dict.fromkeys(row.image_set for row in rows))
+    groups = [(name, [row for row in rows if row.image_set == name]) for name in sets]
+    if len(sets) > 1:
+        groups.append(("all sets", list(rows)))
+    return [{"set": name, **_summary(group)} for name, group in groups]
+
+
+def _summary(rows: Sequence[Row]) -> dict[str, float | str | int]:
+    errors = [row.error for row in rows if row.error is not None]
+    nothing = np.full((2, 1), np.nan)
+    pixels = rms(np.concatenate([nothing, *(error.squares_px for error in errors)], axis=1))
+    degrees = np.degrees(rms(np.concatenate([nothing, *(error.squares for error in errors)], axis=1)))
+    total = Overlap(*(sum(row.overlap[i] for row in rows) for i in range(4)))
+    return {
+        "images": len(rows),
+        "dice_mean": float(np.mean([row.overlap.dice for row in rows])),
+        "dice_pooled": total.dice,
+        "g0_px": float(pixels[0]),
+        "g1_px": float(pixels[1]),
+        "average_px": float(pixels.mean()),
+        "g0_deg": float(degrees[0]),
+        "g1_deg": float(degrees[1]),
+        "average_deg": float(degrees.mean()),
+        "missed": float(np.mean([error.missed.mean() for error in errors])) if errors else float("nan"),
+    }
+
+
+def write_csv(rows: Sequence[Row], out: Path) -> None:
+    """Write `images.csv`, a line an image, and `table.csv`, a line a set."""
+    with (out / "images.csv").open("w", newline="", encoding="utf-8") as file:
+        lines = [
+            {"set": row.image_set, "name": row.name, **row.overlap._asdict(), **_summary([row])}
+            for row in rows
+        ]
+        for line in lines:
+            line.pop("images")
+            line.pop("dice_pooled")
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        writer.writerows(lines)
+    with (out / "table.csv").open("w", newline="", encoding="utf-8") as file:
+        summary = table(rows)
+        writer = csv.DictWriter(file, list(summary[0]))
+        writer.writeheader()
+        writer.writerows(summary)
+
+
+def _printed(rows: Sequence[Row]) -> None:
+    names = ("images", "Dice", "G0 px", "G1 px", "G0 deg", "G1 deg", "average deg", "missed")
+    print(f"{'set':<28}" + "".join(f"{name:>12}" for name in names))
+    for line in table(rows):
+        values = [
+            f"{line['images']}",
+            f"{line['dice_mean']:.4f}",
+            f"{line['g0_px']:.2f}",
+            f"{line['g1_px']:.2f}",
+        ]
+        values += [f"{line[key]:.3f}" for key in ("g0_deg", "g1_deg", "average_deg")]
+        print(
+            f"{line['set']!s:<28.28}"
+            + "".join(f"{value:>12}" for value in [*values, f"{line['missed']:.1%}"])
+        )
+
+
+def _write_sheet(rows: Sequence[Image], path: Path) -> None:
+    width = max(row.shape[1] for row in rows)
+    padded = [np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows]
+    cv2.imwrite(str(path), np.vstack(padded))
+
+
+def _files(folder: Path) -> dict[Path, Path]:
+    if not folder.is_dir():
+        raise PerceptionError(f"{folder} is no folder")
+    return {
+        path.relative_to(folder).with_suffix(""): path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() in SUFFIXES
+    }
+
+
+def _image(path: Path) -> Image:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise PerceptionError(f"{path} is no image that can be read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _mask(path: Path) -> Mask:
+    """The gap is what is brighter than half; in masks of 0 and 1, what is 1."""
+    image = _image(path).max(axis=2)
+    return np.asarray(image > (0 if image.max() <= 1 else 127))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
+    parser.add_argument("predicted", type=Path, help="folder of predicted masks, or a bag with truth")
+    parser.add_argument("marked", type=Path, nargs="?", help="folder of hand-marked masks of the same names")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="FOLDER", help="the images themselves, for the sheet"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/evaluate"), metavar="FOLDER")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="camera; without it the paper's 90 x 90 degrees"
+    )
+    parser.add_argument("--image-topic", default="/knee_gap/image_raw/compressed")
+    parser.add_argument("--truth-topic", default="/knee_gap/gap_mask_true")
+    parser.add_argument(
+        "--mask-topic", help="predicted masks of the bag; without it the images are segmented"
+    )
+    parser.add_argument("--segmentation", default="otsu", help="how, where images are segmented")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Evaluate; 0 when everything was judged and written."""
+    arguments = _parser().parse_args(argv)
+    try:
+        camera = None
+        if arguments.calibration is not None:
+            camera = load_calibration(arguments.calibration).require_camera().camera()
+        if arguments.marked is None:
+            count, pairs = bag_pairs(
+                arguments.predicted,
+                arguments.image_topic,
+                arguments.truth_topic,
+                arguments.mask_topic,
+                arguments.segmentation,
+            )
+        else:
+            count, pairs = folder_pairs(arguments.predicted, arguments.marked, arguments.pictures)
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        rows = evaluate(_progress(pairs, count), camera, arguments.out)
+        write_csv(rows, arguments.out)
+    except (PerceptionError, OSError) as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        return 1
+    _printed(rows)
+    print(f"{arguments.out}: table.csv, images.csv, sheet.png, difference/")
+    return 0
+
+
+def _progress(pairs: Iterable[Pair], count: int) -> Iterator[Pair]:
+    """A bar on a terminal; a line at each tenth elsewhere."""
+    if sys.stderr.isatty():
+        yield from tqdm(pairs, total=count, desc="evaluating", unit="image")
+        return
+    for index, pair in enumerate(pairs):
+        if index % max(1, count // 10) == 0:
+            print(f"evaluating: image {index} of {count}", file=sys.stderr, flush=True)
+        yield pair
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""`calibrate` on a small simulated bag: the whole way from pictures to a file, and a user's mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knee_gap_perception.calibration.bag_input import CalibrationBag
+from knee_gap_perception.calibration.calibration_file import load_calibration
+from knee_gap_perception.calibration.command import main
+from knee_gap_perception.calibration.rigid import from_vector, inverse, to_vector
+from knee_gap_replay.bag import BagReader
+from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
+from knee_gap_simulation.rigid import transform
+
+BOARD = "charuco:12x9:3:2"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("calibration") / "bag"
+    make_calibration_bag(path, CalibrationRecording(seed=31, fps=6, board_s=12, oblique_s=0, pivot_s=6))
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, list[str]]:
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, [line for line in printed.err.splitlines() if "%" not in line]
+
+
+def test_a_bag_becomes_a_calibration(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "scope.yaml"
+    for step, extra in (("intrinsics", ["--board", BOARD]), ("hand_eye", ["--board", BOARD]), ("pivot", [])):
+        code, _, errors = run(capsys, step, bag, "--into", out, "--views", 24, *extra)
+        assert (code, errors) == (0, [])
+    found = load_calibration(out)
+    with BagReader(bag) as reader:
+        truth = json.loads(reader.metadata["knee_gap_calibration_truth"])
+    assert found.camera is not None
+    assert found.lens is not None
+    assert found.tip is not None
+    assert found.clock is not None
+    assert found.camera.parameters[0] == pytest.approx(truth["lens"]["focal_px"], abs=0.5)
+    quaternion, translation = (
+        np.array(truth["T_body_lens"][key]) for key in ("quaternion_xyzw", "translation")
+    )
+    angle = 2 * np.arccos(quaternion[3])
+    true_lens = transform(quaternion[:3] / np.linalg.norm(quaternion[:3]) * angle, translation)
+    error = to_vector(inverse(found.body_to_lens()) @ true_lens)
+    assert np.linalg.norm(error[3:]) < 0.2e-3
+    assert np.linalg.norm(error[:3]) < np.radians(0.2)
+    assert error @ np.linalg.solve(found.lens.covariance, error) < 22.5  # 99.9 % of 6 degrees of freedom
+    assert abs(found.clock.offset - truth["time_offset"]) < 1e-3
+    assert np.linalg.norm(found.tip.position - truth["tip"]) < 0.1e-3
+    code, text, _ = run(capsys, "show", out)
+    assert code == 0
+    assert found.hash in text
+
+
+def test_steps_of_a_bag(bag: Path) -> None:
+    steps = CalibrationBag(bag).steps()
+    assert list(steps) == ["board", "pivot"]
+    stamps = CalibrationBag(bag).part("board").image_stamps("/knee_gap/image_raw/compressed")
+    assert len(stamps) == 72
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["intrinsics", "BAG", "--into", "OUT"], "Say --board"),
+        (["intrinsics", "BAG", "--into", "OUT", "--board", "chess"], "a board is charuco"),
+        (["intrinsics", "BAG", "--into", "OUT", "--board", "dots:4x11:2"], "found in none of"),
+        (["intrinsics", "BAG", "--into", "OUT", "--board", BOARD, "--views", "2"], "--views"),
+        (
+            ["intrinsics", "BAG", "--into", "OUT", "--board", BOARD, "--image-topic", "/camera"],
+            "topics of that kind",
+        ),
+        (["time_offset", "BAG", "--into", "OUT", "--pose-topic", "/nowhere"], "/knee_gap/scope_body/pose"),
+        (["oblique", "BAG", "--into", "OUT", "--board", BOARD, "--end", "2"], "about a second"),
+        (["pivot", "BAG", "--into", "OUT"], "calibrate intrinsics first"),
+        (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "no ROS 2 bag"),
+        (["show", "OUT"], "cannot be read"),
+    ],
+)
+def test_mistakes_are_one_line(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
+) -> None:
+    places = {"BAG": str(bag), "OUT": str(tmp_path / "scope.yaml"), "NOWHERE": str(tmp_path / "nowhere")}
+    code, _, errors = run(capsys, *(places.get(argument, argument) for argument in arguments))
+    assert code == 1
+    assert len(errors) == 1
+    assert reason in errors[0]
+    assert not (tmp_path / "scope.yaml").exists()
+
+
+def test_the_turn_of_a_fixed_scope_is_identity(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A scope that was never turned is calibrated, and a turn of it is refused rather than guessed."""
+    out = tmp_path / "scope.yaml"
+    assert run(capsys, "hand_eye", bag, "--into", out, "--views", 20, "--board", BOARD)[0] == 0
+    found = load_calibration(out)
+    assert found.body_to_lens(0.0) == pytest.approx(
+        found.require_lens().T_body_lens @ from_vector(np.zeros(6))
+    )
+    with pytest.raises(ValueError, match="axis is not calibrated"):
+        found.body_to_lens(0.2)

@@ -1,0 +1,147 @@
+"""The calibration's file: round trip, hash, refusals; what the lens's error does to two views."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knee_gap_perception.calibration.calibration_file import (
+    Calibration,
+    Clock,
+    LensOnBody,
+    Oblique,
+    Tip,
+    load_calibration,
+    save_calibration,
+)
+from knee_gap_perception.calibration.intrinsics import Intrinsics
+from knee_gap_perception.calibration.lens_error import lens_covariance, lens_errors
+from knee_gap_perception.calibration.rigid import from_vector, to_vector
+from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
+from knee_gap_perception.errors import PerceptionError
+
+
+def covariance(size: int, scale: float) -> np.ndarray:  # type: ignore[type-arg]
+    A = np.random.default_rng(size).standard_normal((size, size)) * scale
+    return A @ A.T
+
+
+CAMERA = Intrinsics(
+    1280, 720, "equidistant", (452.1, 0.0, 646.2, 0.0, 452.4, 358.7, 0.0, 0.0, 1.0), (1e-3, -2e-3, 0.0, 0.0),
+    covariance(8, 0.02), 0.06, 0.04, 1.2, 48, 3489,
+)  # fmt: skip
+LENS = LensOnBody(
+    np.array([0.0035, -0.012, 0.2031]), np.array([0.24, -0.02, -0.03, np.sqrt(1 - 0.0589)]),
+    covariance(6, 1e-5), Mount.CAMERA_HEAD, 7e-5, 3.7e-5, 0.4, 48,
+)  # fmt: skip
+WHOLE = Calibration(
+    1280,
+    720,
+    CAMERA,
+    LENS,
+    Oblique(-0.56, ShaftAxis(np.array([0.0, 0.6, 0.8]), np.array([0.003, -0.012, 0.1])), 5e-5, 4e-6),
+    Tip(np.array([0.0035, -0.012, 0.2043]), covariance(3, 1e-6), 4e-5),
+    Clock(-0.01198, 6e-5, "board"),
+)
+
+
+def test_a_calibration_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    save_calibration(WHOLE, tmp_path / "scope.yaml")
+    back = load_calibration(tmp_path / "scope.yaml")
+    assert back.hash == WHOLE.hash
+    assert back.camera is not None
+    assert back.camera.covariance == pytest.approx(CAMERA.covariance)
+    assert back.body_to_lens(0.4) == pytest.approx(WHOLE.body_to_lens(0.4))
+    assert back.clock == WHOLE.clock
+
+
+def test_parts_may_be_missing(tmp_path: Path) -> None:
+    save_calibration(Calibration(640, 480), tmp_path / "scope.yaml")
+    back = load_calibration(tmp_path / "scope.yaml")
+    with pytest.raises(PerceptionError, match="calibrate intrinsics"):
+        back.require_camera()
+    with pytest.raises(PerceptionError, match="calibrate hand_eye"):
+        back.body_to_lens()
+    with pytest.raises(PerceptionError, match="calibrate oblique"):
+        back.scope_turn(0.1)
+
+
+def test_the_hash_tells_any_change() -> None:
+    changed = [
+        replace(WHOLE, width_px=1281),
+        replace(WHOLE, camera=replace(CAMERA, d=(1.0000001e-3, -2e-3, 0.0, 0.0))),
+        replace(WHOLE, lens=replace(LENS, translation=LENS.translation * (1 + 1e-9))),
+        replace(WHOLE, tip=None),
+    ]
+    assert len({WHOLE.hash, *(other.hash for other in changed)}) == 5
+
+
+def test_a_file_changed_by_hand_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scope.yaml"
+    save_calibration(WHOLE, path)
+    path.write_text(path.read_text().replace("0.2031", "0.2032"))
+    with pytest.raises(PerceptionError, match="does not match its hash"):
+        load_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a: [", "not YAML"),
+        ("a: 1", "no calibration"),
+        ("format: knee_gap_calibration 1\nimage: 3", "malformed"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "scope.yaml"
+    path.write_text(text)
+    with pytest.raises(PerceptionError, match=reason):
+        load_calibration(path)
+    with pytest.raises(PerceptionError, match="cannot be read"):
+        load_calibration(tmp_path / "missing.yaml")
+
+
+def test_images_of_another_size_are_refused() -> None:
+    WHOLE.require_image_size(1280, 720)
+    with pytest.raises(PerceptionError, match="made for images of 1280x720 px, not 1920x1080"):
+        WHOLE.require_image_size(1920, 1080)
+    with pytest.raises(PerceptionError, match="1280x720"):
+        WHOLE.with_parts(640, 480, tip=None)
+
+
+def test_the_notch_tells_the_turn() -> None:
+    assert WHOLE.scope_turn(-0.56 + 0.3) == pytest.approx(0.3)
+    assert WHOLE.scope_turn(np.pi - 0.1) == pytest.approx(np.pi - 0.1 + 0.56 - 2 * np.pi)
+
+
+def test_pure_travel_does_not_feel_where_the_lens_sits() -> None:
+    exact = replace(LENS, rotation_error=0.0, translation_error=0.0)
+    first = from_vector([0.3, 0.2, 0.1, 0, 0, 0])
+    along = first.copy()
+    along[:3, 3] += [0.008, 0, 0]
+    assert lens_errors(first, along, exact)[0] == pytest.approx(0.0, abs=1e-12)
+    turned = first @ from_vector([0.2, 0, 0, 0.008, 0, 0])
+    assert lens_errors(first, turned, exact)[0] > 1e-7
+
+
+def test_the_covariance_of_a_baseline_is_that_of_many_calibrations() -> None:
+    rng = np.random.default_rng(3)
+    first, second = from_vector([0.3, 0.2, 0.1, 0, 0, 0]), from_vector([0.1, -0.2, 0.3, 0.05, 0.02, 0.01])
+    errors = rng.multivariate_normal(np.zeros(6), LENS.covariance, 4000)
+    noise = np.repeat([LENS.rotation_error, LENS.translation_error], 3) / np.sqrt(3)
+    moved = []
+    for error in errors:
+        ends = [
+            T @ from_vector(noise * rng.standard_normal(6)) @ LENS.T_body_lens @ from_vector(error)
+            for T in (first, second)
+        ]
+        moved.append(ends[1][:3, 3] - ends[0][:3, 3])
+    position, _ = lens_covariance(first, second, LENS)
+    # Independent at each of the two views, and the common part twice a half.
+    tracker, _ = lens_covariance(first, first, LENS)
+    expected = 2 * tracker + 4 * (position - lens_covariance(second, second, LENS)[0])
+    assert np.sqrt(np.trace(np.cov(np.array(moved).T))) == pytest.approx(
+        np.sqrt(np.trace(expected)), rel=0.05
+    )
+    assert to_vector(LENS.T_body_lens)[3:] == pytest.approx(LENS.translation)

@@ -1,0 +1,92 @@
+"""Calibration of a real tracked laparoscope, and the distances of known dots that it then measures."""
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knee_gap_perception.calibration.boards import BoardView
+from knee_gap_perception.calibration.hand_eye import HandEye, calibrate_hand_eye
+from knee_gap_perception.calibration.hand_eye_bundle import TrackedView
+from knee_gap_perception.calibration.intrinsics import fit_intrinsics
+from knee_gap_perception.calibration.lens_error import lens_errors
+from knee_gap_perception.calibration.lens_model import LensModel
+from knee_gap_perception.calibration.pivot import calibrate_pivot
+from knee_gap_perception.calibration.rigid import Array
+from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_uncertainty.gap_range import gap_range
+
+DATA = Path(__file__).parents[4] / "shared" / "data" / "images" / "tracked_laparoscope"
+SESSION = DATA / "session_15-04-12"
+SIZE = (1920, 540)
+
+pytestmark = pytest.mark.skipif(
+    not SESSION.is_dir(), reason=f"the recordings of a tracked laparoscope are not at {DATA}"
+)
+
+
+def transform_mm(path: Path) -> Array:
+    T = np.loadtxt(path)
+    T[:3, 3] *= 1e-3
+    return np.asarray(T)
+
+
+def session() -> list[TrackedView]:
+    model = {int(row[0]): row[1:4] * 1e-3 for row in np.loadtxt(DATA / "April216mm_centres.txt")}
+    tracked = []
+    for index in range(4):
+        rows = np.loadtxt(SESSION / f"calib.left.points.{index}.txt")
+        ids = rows[:, 0].astype(int)
+        view = BoardView(index, ids, np.array([model[i] for i in ids]), rows[:, 1:])
+        tracked.append(TrackedView(view, transform_mm(SESSION / f"calib.tracking.{index}.4x4"), np.zeros(6)))
+    return tracked
+
+
+def calibrated(model: LensModel) -> HandEye:
+    tracked = session()
+    fit = fit_intrinsics([view.board for view in tracked], *SIZE, model)
+    return calibrate_hand_eye(tracked, fit.intrinsics, model)
+
+
+@pytest.mark.parametrize("name", ["plumb_bob", "equidistant"])
+def test_dot_distances_by_motion_stereo(name: str) -> None:
+    """Every distance of two dots lies in its worst-case range, and the median ratio is right to 5 %."""
+    found, tracked = calibrated(LensModel(name)), session()
+    camera = found.intrinsics.camera()
+    ratios, inside, total = [], 0, 0
+    rng = np.random.default_rng(1)
+    for first, second in combinations(tracked, 2):
+        ids, in_first, in_second = np.intersect1d(first.board.ids, second.board.ids, return_indices=True)
+        lens = [view.T_world_body @ found.T_body_lens for view in (first, second)]
+        translation_error, angular_error = lens_errors(first.T_world_body, second.T_world_body, found)
+        bearings = [
+            camera.bearings(view.board.pixels[chosen]) @ T[:3, :3].T
+            for view, chosen, T in zip((first, second), (in_first, in_second), lens, strict=True)
+        ]
+        points = first.board.points[in_first]
+        pairs = list(combinations(range(len(ids)), 2))
+        for i, j in [pairs[k] for k in rng.choice(len(pairs), min(25, len(pairs)), replace=False)]:
+            true = float(np.linalg.norm(points[i] - points[j]))
+            total += 1
+            try:
+                measured = gap_range(
+                    lens[0][:3, 3], lens[1][:3, 3], bearings[0][[i, j]], bearings[1][[i, j]],
+                    angular_error=angular_error, translation_error=translation_error,
+                )  # fmt: skip
+            except MeasurementError:
+                continue
+            ratios.append(measured.gap / true)
+            inside += measured.gap_min <= true <= measured.gap_max
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.05)
+    assert inside == len(ratios) > 0.5 * total
+
+
+def test_pivoting_a_real_scope() -> None:
+    """Halves of the recording agree within what each says of itself."""
+    poses = np.array([transform_mm(path) for path in sorted((DATA / "pivot").glob("*.txt"))])
+    whole, halves = calibrate_pivot(poses), (calibrate_pivot(poses[:200]), calibrate_pivot(poses[200:]))
+    assert whole.rms < 4e-3
+    difference = halves[0].tip - halves[1].tip
+    spread = halves[0].covariance + halves[1].covariance
+    assert difference @ np.linalg.solve(spread, difference) < 16.3  # 99.9 % of 3 degrees of freedom
