@@ -18,6 +18,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
+            "coverage = knee_gap_uncertainty.coverage.command:main",
             "study = knee_gap_uncertainty.study.command:main",
             "uncertainty_node = knee_gap_uncertainty.uncertainty_node:main",
         ],

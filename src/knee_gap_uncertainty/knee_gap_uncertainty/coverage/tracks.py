@@ -5,13 +5,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.coverage.cells import SHARES, Cell, Scene
+from knee_gap_uncertainty.coverage.cells import Cell, Scene
 
 Array = npt.NDArray[np.float64]
 
 # The line of the gap leans this far out of the image plane, so that errors in depth enter the gap at first
 # order.
 LEAN = np.radians(20.0)
+# Radii of the independent and of the common part of the image error, as shares of theta.
+PARTS = {"independent": (1.0, 0.0), "half": (0.5, 0.5), "common": (0.0, 1.0)}
 
 
 class Tracks(NamedTuple):
@@ -48,27 +50,37 @@ def simulate(cell: Cell, count: int, rng: np.random.Generator) -> Tracks:
     """
     errors, bounded = cell.errors, cell.noise == "bounded"
     lens, points = true_track(cell.scene, cell.view_count)
-    towards = points - lens[:, None]
-    true_bearings = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    bearings = true_bearings(lens, points)
     shape = (count, cell.view_count)
-
-    share = SHARES[cell.share]
-    parts = {0.0: (1.0, 0.0), 0.5: (0.5, 0.5), 1.0: (0.0, 1.0)}[share]
-    image = parts[0] * errors.image_error * _disc((*shape, 2), bounded, rng)
-    image += parts[1] * errors.image_error * _disc((count, 1, 2), bounded, rng)
-    axes = _image_axes(true_bearings)
-    shifted = _turn(true_bearings, np.einsum("...a,...ak->...k", image, axes))
+    own, common = PARTS[cell.share]
+    image = own * errors.image_error * _disc((*shape, 2), bounded, rng)
+    image += common * errors.image_error * _disc((count, 1, 2), bounded, rng)
+    shifted = _turn(bearings, np.einsum("...a,...ak->...k", image, _image_axes(bearings)))
     rotation = errors.rotation_error * _ball(shape, bounded, rng)
-    bearings = shifted + np.cross(rotation[:, :, None], shifted)
-    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    measured = shifted + np.cross(rotation[:, :, None], shifted)
+    measured /= np.linalg.norm(measured, axis=-1, keepdims=True)
+    deviation, lens_variance, rotation_variance = deviations(cell)
     return Tracks(
         lens=lens + errors.translation_error * _ball(shape, bounded, rng),
-        bearings=bearings,
+        bearings=measured,
         gap=cell.scene.gap,
-        deviation=0.5 * errors.image_error * float(np.hypot(*parts)),
-        lens_variance=errors.translation_error**2 / 5.0,
-        rotation_variance=errors.rotation_error**2 / 5.0,
+        deviation=deviation,
+        lens_variance=lens_variance,
+        rotation_variance=rotation_variance,
     )
+
+
+def true_bearings(lens: Array, points: Array) -> Array:
+    """(N, 2, 3) unit vectors from the lens positions (N, 3) to the points (2, 3)."""
+    towards = points - lens[:, None]
+    return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+
+
+def deviations(cell: Cell) -> tuple[float, float, float]:
+    """Of each axis: deviation of a bearing [rad], variances of lens position [m^2] and rotation [rad^2]."""
+    errors = cell.errors
+    image = 0.5 * errors.image_error * float(np.hypot(*PARTS[cell.share]))
+    return image, errors.translation_error**2 / 5.0, errors.rotation_error**2 / 5.0
 
 
 def _disc(shape: tuple[int, ...], bounded: bool, rng: np.random.Generator) -> Array:

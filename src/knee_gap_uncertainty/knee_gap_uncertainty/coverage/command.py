@@ -1,0 +1,107 @@
+"""`coverage`: how often the intervals hold the truth, cell by cell, as a table (CSV) and a plot."""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from knee_gap_uncertainty import gap_range, multi_view
+from knee_gap_uncertainty.coverage.measure import batches, measure
+from knee_gap_uncertainty.coverage.plot import save_plot
+from knee_gap_uncertainty.coverage.table import Row, summary, write_csv
+
+DEFAULT_RUNS = 100
+FULL_RUNS = 3000
+MOST_RUNS = 100_000
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study; 0 when all was written, 2 for a user's mistake."""
+    parser = argparse.ArgumentParser(prog="coverage", description=__doc__)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/coverage"), help="where to write (out/coverage)"
+    )
+    parser.add_argument(
+        "--runs",
+        type=int,
+        default=DEFAULT_RUNS,
+        help=f"simulated tracks of each cell ({DEFAULT_RUNS}: a look; {FULL_RUNS}: coverage to 0.4 %%)",
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the tracks (1)")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="cores to use (all)")
+    options = parser.parse_args(argv)
+    if not 10 <= options.runs <= MOST_RUNS:
+        return refuse(f"--runs must be from 10 to {MOST_RUNS}, got {options.runs}")
+    if options.seed < 0:
+        return refuse(f"--seed must not be negative, got {options.seed}")
+    if options.processes < 1:
+        return refuse(f"--processes must be at least 1, got {options.processes}")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        rows = with_ranges(study(options.runs, options.seed, options.processes))
+        write_csv(options.out / "coverage.csv", rows)
+        save_plot(options.out / "coverage.png", rows)
+    except OSError as error:
+        return refuse(f"cannot write to {options.out}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        return refuse("stopped")
+    print(f"{len(rows)} cells, {options.runs} runs each, seed {options.seed}")
+    print("\n".join(summary(rows)))
+    print(f"written: {options.out / 'coverage.csv'}, {options.out / 'coverage.png'}")
+    return 0
+
+
+def refuse(reason: str) -> int:
+    """Say in one line what the user must change."""
+    print(f"coverage: {reason}", file=sys.stderr)
+    return 2
+
+
+def study(runs: int, seed: int, processes: int) -> list[Row]:
+    """All rows, in the order of the cells whichever process finished first."""
+    # Compiled once, before the processes that would all compile at the same time.
+    multi_view.warm_up()
+    gap_range.warm_up()
+    todo = list(batches())
+    measure(todo[0], 10, seed)
+    found: dict[int, list[Row]] = {}
+    with ProcessPoolExecutor(processes) as pool:
+        # The longest first, so that no core waits for one at the end.
+        order = sorted(todo, key=lambda batch: -batch.cells[0].view_count)
+        futures = {pool.submit(measure, batch, runs, seed): batch for batch in order}
+        for future in _with_progress(as_completed(futures), len(todo)):
+            found[futures[future].number] = future.result()
+    return [row for number in sorted(found) for row in found[number]]
+
+
+def _with_progress(finished: Iterable, total: int) -> Iterator:  # type: ignore[type-arg]
+    if sys.stderr.isatty():
+        yield from tqdm(finished, total=total, desc="coverage", unit="batch")
+        return
+    told = 0
+    for count, future in enumerate(finished, start=1):
+        if 10 * count // total > told:
+            told = 10 * count // total
+            print(f"coverage: {10 * told} %", file=sys.stderr, flush=True)
+        yield future
+
+
+def with_ranges(rows: Sequence[Row]) -> list[Row]:
+    """Rows with the widths of the ranges beside them also where more views lie between the first and last."""
+    keys = ("depth_mm", "gap_mm", "travel_mm", "direction_deg", "errors", "share", "noise")
+    ranges = ("worst_case_coverage", "worst_case_width_mm", "paper_coverage", "paper_width_mm")
+    of_two = {
+        tuple(getattr(row, key) for key in keys): {name: getattr(row, name) for name in ranges}
+        for row in rows
+        if row.views == 2 and row.model == "right"
+    }
+    return [replace(row, **of_two[tuple(getattr(row, key) for key in keys)]) for row in rows]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
