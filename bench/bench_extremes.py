@@ -188,7 +188,8 @@ def long_run(updates: int) -> str:
     tenth = updates // 10
     early, late = np.median(times[:tenth]) * 1e3, np.median(times[-tenth:]) * 1e3
     return (
-        f"  {updates} updates, processor time: median {early:.3f} ms in the first tenth, {late:.3f} ms in the last "
+        f"  {updates} updates, processor time: median {early:.3f} ms in the first tenth, "
+        f"{late:.3f} ms in the last "
         f"(ratio {late / early:.2f}), 99 % below {np.quantile(times, 0.99) * 1e3:.2f} ms; "
         f"memory {memory[0]:.1f} MB after the first tenth, {memory[-1]:.1f} MB at the end"
     )
