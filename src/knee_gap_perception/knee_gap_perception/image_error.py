@@ -3,14 +3,15 @@
 The paper measures "errors around the two gap points" (figure 4a, Table 2) and leaves the procedure to a
 figure. Here:
 
-1. The section is that of the *marked* gap: the largest disc inscribed in it, and through its centre the
-direction in which the gap is narrowest. G0 and G1 are where the marked gap ends along that direction; G0 is
-the upper one, or the left one of two at the same height. 2. Around each point, on lines parallel to the
-section up to the disc's radius to either side of it, the distance along the line between the end of the
-marked gap and the end of the predicted gap is taken: the white areas of figure 4a. The predicted gap on a
-line is the run of pixels that shares most with the marked run. 3. The error of a point is the RMS over its
-lines, in pixels, and as the angle between the two ends under the camera model. Lines on which nothing was
-predicted have no error; their share is told as `missed`.
+- The section is that of the *marked* gap: the largest disc inscribed in it, and through its centre the
+  direction in which the gap is narrowest. G0 and G1 are where the marked gap ends along that direction; G0
+  is the upper one, or the left one of two at the same height.
+- Around each point, on lines parallel to the section up to the disc's radius to either side of it, the
+  distance along the line between the end of the marked gap and the end of the predicted gap is taken: the
+  white areas of figure 4a. The predicted gap on a line reaches over all its runs of pixels that overlap the
+  marked run: a hole inside is no error of the edge.
+- The error of a point is the RMS over its lines, in pixels, and as the angle between the two ends under the
+  camera model. Lines on which nothing was predicted have no error; their share is told as `missed`.
 """
 
 from dataclasses import dataclass
@@ -124,12 +125,9 @@ def edge_error(predicted: Mask, marked: Mask, camera: Camera) -> EdgeError | Non
         if marked_run is None:
             continue
         ends[i, 0] = line[[marked_run[0], marked_run[1] - 1]]
-        shared = [
-            (min(b, marked_run[1]) - max(a, marked_run[0]), a, b) for a, b in _runs(_sampled(predicted, line))
-        ]
-        best = max(shared, default=(0, 0, 0))
-        if best[0] > 0:
-            ends[i, 1] = line[[best[1], best[2] - 1]]
+        touching = [run for run in _runs(_sampled(predicted, line)) if _overlap(run, marked_run)]
+        if touching:
+            ends[i, 1] = line[[touching[0][0], touching[-1][1] - 1]]
     gap = ends[:, 1] - ends[:, 0]
     bearings = camera.bearings(ends)
     chord = np.linalg.norm(bearings[:, 1] - bearings[:, 0], axis=-1)
@@ -187,3 +185,8 @@ def _runs(line: Mask) -> list[tuple[int, int]]:
 def _away(run: tuple[int, int], middle: int) -> int:
     """Samples between a run and the middle of a line; 0 where it lies on it."""
     return max(run[0] - middle, middle - run[1] + 1, 0)
+
+
+def _overlap(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Whether two runs share a sample."""
+    return first[0] < second[1] and second[0] < first[1]

@@ -79,6 +79,15 @@ def test_rms_follows_a_wavy_edge() -> None:
     assert error.rms_px[1] == pytest.approx(0, abs=0.3)
 
 
+def test_a_hole_inside_is_no_error_of_the_edge() -> None:
+    marked = band(-40, 40)
+    predicted = marked.copy()
+    predicted[355:362, 600:700] = False
+    error = edge_error(predicted, marked, PAPER)
+    assert error is not None
+    assert error.rms_px == pytest.approx(0, abs=1e-9)
+
+
 def test_nothing_predicted_is_missed_not_zero() -> None:
     error = edge_error(np.zeros((720, 1280), bool), band(-40, 40), PAPER)
     assert error is not None

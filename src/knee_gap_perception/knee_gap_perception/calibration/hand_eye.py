@@ -50,6 +50,8 @@ MIN_SCOPE_TURN = np.radians(20.0)  # spread of scope turns from which the shaft'
 TRANSLATION_ERROR = 0.0367e-3
 ROTATION_ERROR = np.radians(0.004)
 START_SCALE = 5.0
+OUTLYING_TIMES, OUTLYING_PX = 6.0, 2.0  # a view is left out beyond both, in medians and in pixels
+OUTLYING_VIEWS = 12
 SYSTEMATIC_DEPTHS = (
     2.0  # a bias that grows over the picture moves the lens by this many times angle x distance
 )
@@ -98,6 +100,14 @@ class HandEye:
     left_out_rms_px: Array
     chi_square_per_freedom: float
     solvers: tuple[SolverResult, ...]
+
+    @property
+    def outlying(self) -> npt.NDArray[np.bool_]:
+        """Views (n,) that the others do not explain; never among few, and never more than a fifth of them."""
+        rms = self.left_out_rms_px
+        worst = rms > max(OUTLYING_TIMES * float(np.median(rms)), OUTLYING_PX)
+        enough = len(rms) >= OUTLYING_VIEWS and worst.mean() <= 0.2
+        return worst if enough else np.zeros(len(rms), dtype=bool)
 
     @property
     def position_sigma(self) -> Array:

@@ -32,6 +32,7 @@ from knee_gap_perception.calibration.time_offset import estimate_time_offset
 from knee_gap_perception.errors import PerceptionError
 
 FIXED_TURN = np.radians(2.0)  # turns of the scope that `hand_eye`, which takes it as fixed, lets pass
+MAX_PASSES = 5  # of hand-eye, for a better time and without views that do not fit
 DISAGREEMENT = 4.0  # standard errors between two estimates of the clock, from which they are called different
 
 Progress = Callable[[Iterable[int], str], Iterable[int]]
@@ -261,15 +262,19 @@ class Procedure:
         if request.free_intrinsics:
             camera = fit.intrinsics
         settings = HandEyeSettings(free_intrinsics=request.free_intrinsics, mount=request.mount)
-        offset, found = self._offset(known), None
-        for _ in range(3):
-            views = tracked_views(fit.views, kept_turns, sigmas, self._poses(), offset)
+        offset, keep = self._offset(known), np.ones(len(fit.views), dtype=bool)
+        for _ in range(MAX_PASSES):
+            chosen = [view for view, good in zip(fit.views, keep, strict=True) if good]
+            views = tracked_views(chosen, kept_turns[keep], sigmas[keep], self._poses(), offset)
             found = calibrate_hand_eye(views, camera, model, settings)
-            # Poses are read again at the better time, until what is left is too short to matter.
             offset += found.time_offset
-            if abs(found.time_offset) < 5e-4:
+            bad = {view.board.stamp_ns for view, out in zip(views, found.outlying, strict=True) if out}
+            keep &= np.array([view.stamp_ns not in bad for view in fit.views])
+            # Poses are read again at the better time, until what is left is too short to matter.
+            if abs(found.time_offset) < 5e-4 and not bad:
                 break
-        assert found is not None
+        if left_out := int((~keep).sum()):
+            self._report(f"{left_out} of {len(keep)} views left out: the others do not explain them")
         found = replace(found, time_offset=offset)
         self._tell(found, len(views))
         return found, known
