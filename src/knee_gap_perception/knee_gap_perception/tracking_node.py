@@ -108,7 +108,9 @@ class TrackingNode(BaseNode):
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
         source = self._feed.status()
-        refused = {f"refused: {reason}": count for reason, count in self._tracker.validity.counts.items()}
+        refused = {
+            f"refused: {reason}": count for reason, count in dict(self._tracker.validity.counts).items()
+        }
         words = f"{accepted} poses in the last second" if source.ok else source.words
         counts = {"accepted": self._tracker.accepted_count, **source.values, **refused}
         return source.ok and accepted > 0, words, counts

@@ -9,7 +9,11 @@ from typing import Any, Self
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.messages_tracking import body_pose_from_message, fill_lens_pose
+from knee_gap_perception.messages_tracking import fill_lens_pose
+from knee_gap_perception.optitrack.body_source import choose_body
+from knee_gap_perception.optitrack.natnet_client import NatNetParameters
+from knee_gap_perception.optitrack.pose_topic import PoseTopics
+from knee_gap_perception.optitrack.scope_feed import SCOPE, SourceParameters
 from knee_gap_perception.pose_validity import ValidityParameters
 from knee_gap_perception.poses import LensPose
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
@@ -30,7 +34,7 @@ _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
     "segmentation_node": (EdgeParameters,),
-    "tracking_node": (TrackingParameters, ValidityParameters),
+    "tracking_node": (TrackingParameters, ValidityParameters, SourceParameters, NatNetParameters),
     "uncertainty_node": (EstimatorParameters, AdviceParameters),
 }
 
@@ -46,12 +50,14 @@ class GapPipeline:
         """
         file.refuse_unknown(PARAMETERS)
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
+        tracking, validity, source, _ = built["tracking_node"]
         return cls(
             EdgeStream(*built["segmentation_node"]),
-            ScopeTracker(*built["tracking_node"]),
+            ScopeTracker(tracking, validity),
             GapEstimator(*built["uncertainty_node"]),
             topics,
             space,
+            up_axis=source.resolved_up_axis(),
         )
 
     def __init__(
@@ -61,9 +67,17 @@ class GapPipeline:
         estimator: GapEstimator,
         topics: InputTopics,
         space: str,
+        *,
+        up_axis: str = "z",
     ) -> None:
         self._detector = detector
         self._tracker = tracker
+        # A bag holds topics; what came straight from Motive was recorded as the pose of the lens.
+        reference = tracker.parameters.reference_body
+        self._body_names = {topics.body_pose: SCOPE}
+        if reference:
+            self._body_names[f"{space}/reference_body/pose"] = reference
+        self._bodies = PoseTopics([*self._body_names.values()], up_axis=up_axis)
         self._estimator = estimator
         self._topics = topics
         self._space = space
@@ -71,7 +85,7 @@ class GapPipeline:
         # The estimator's clock: it follows the stamps, and stands still where they run backwards.
         self._now_ns = 0
         # Before an image comes the camera's model, and the pose of the same instant.
-        self.inputs: Sequence[str] = (topics.camera_info, topics.body_pose, topics.image)
+        self.inputs: Sequence[str] = (topics.camera_info, *self._body_names, topics.image)
         self.outputs: Mapping[str, tuple[str, QosName]] = {
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
@@ -89,8 +103,8 @@ class GapPipeline:
         yield from self._advice()
         if topic == self._topics.camera_info:
             self._detector.on_camera_info(message)
-        elif topic == self._topics.body_pose:
-            yield from self._on_body_pose(message)
+        elif topic in self._body_names:
+            yield from self._on_body_pose(self._body_names[topic], message)
         else:
             yield from self._on_image(message)
 
@@ -99,14 +113,17 @@ class GapPipeline:
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
         yield from self._published(self._estimator.advance(self._now_ns + wait_ns + 1))
 
-    def _on_body_pose(self, message: Any) -> Iterator[Output]:
-        lens = self._tracker.update(body_pose_from_message(message))
-        if not isinstance(lens, LensPose):
-            return
-        pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
-        yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
-        estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
-        yield from self._published(estimates)
+    def _on_body_pose(self, name: str, message: Any) -> Iterator[Output]:
+        self._bodies.put(name, message)
+        for frame in self._bodies.poll():
+            body, others = choose_body(frame, SCOPE)
+            lens = self._tracker.update(body, others) if body is not None else None
+            if not isinstance(lens, LensPose):
+                continue
+            pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
+            yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
+            estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
+            yield from self._published(estimates)
 
     def _on_image(self, message: Any) -> Iterator[Output]:
         edges = self._detector.on_image(message)
