@@ -17,6 +17,7 @@ from knee_gap_uncertainty.errors import (
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
@@ -36,6 +37,9 @@ REASONS: dict[type[MeasurementError], str] = {
 UNBOUNDED = "the admitted errors leave the gap unbounded"
 UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
 CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
+UNCHECKED = "two views cannot check each other"
+# Along the line of the ray from the other view, one of two views may be wrong by any amount.
+FEWEST_VIEWS_TO_CHECK = 3
 
 
 # The direction of travel is that over this time [ns], if the lens went farther in it than this [m].
@@ -62,11 +66,17 @@ class Track:
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
         self._direction = np.full(3, np.nan)
+        self._joint_motion = JointMotionTest()
+        self.ended = False
+        # The last image that was found still, where the window does not keep it.
+        self._passing: Views | None = None
+        self._still_count = 0
         self.situation: Situation | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
         """Whether the edges are of the same two points and the pose of the same reference frame."""
-        return edges.track_id == self.track_id and pose.frame_id == self.frame_id
+        same = edges.track_id == self.track_id and pose.frame_id == self.frame_id
+        return same and not self.ended
 
     def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
@@ -85,21 +95,44 @@ class Track:
         if self._first is None:
             self._first = view
         self._follow_direction(view)
+        views = self._views_with(view.view)
+        fitted, flaw = self._fitted(views)
+        finding = self._joint_motion.judge(views, fitted, self._passing)
+        if finding is not Finding.STILL:
+            return self._contradicted(blank, view, finding)
+        self._still_count += 1
+        self._passing = None if self._window.add(view.view) else view.view
+        if fitted is None:
+            return self._told(blank, view, flaw)
         try:
-            all_views = self._all_views(view)
+            interval = confidence_interval(fitted, self._parameters.confidence_level)
+            all_views = AllViews(views, fitted, interval)
             self.situation = self._situation(edges, view, all_views)
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
             return self._told(blank, view, REASONS.get(type(error), str(error)))
         return self._measured(blank, view, bounds, parallax, all_views)
 
-    def _all_views(self, present: PosedView) -> AllViews:
-        """Fit over the views kept and the present one."""
-        kept = self._window.add(present.view)
-        views = self._window.views(self._parameters.common_share)
-        views = views if kept else views.joined(present.view)
-        fitted = fit(views)
-        return AllViews(views, fitted, confidence_interval(fitted, self._parameters.confidence_level))
+    def _views_with(self, present: Views) -> Views:
+        """The views kept and then the present one, which is not kept before it has been found to fit them."""
+        share = self._parameters.common_share
+        if not len(self._window):
+            return replace(present, common_share=share)
+        return self._window.views(share).joined(present)
+
+    def _fitted(self, views: Views) -> tuple[MultiViewFit | None, str]:
+        """Fit over the views, or why there is none."""
+        try:
+            return fit(views), ""
+        except MeasurementError as error:
+            return None, REASONS.get(type(error), str(error))
+
+    def _contradicted(self, blank: GapEstimate, view: PosedView, finding: Finding) -> GapEstimate:
+        """No number from an image whose points are not where the track has them; the track may end here."""
+        self.ended = finding is Finding.MOVED
+        self.situation = None
+        status = GapStatus.JOINT_MOVED if self.ended else GapStatus.UNKNOWN
+        return replace(self._told(blank, view, finding.value), status=status)
 
     def _follow_direction(self, present: PosedView) -> None:
         """Note where the lens is going; it keeps its direction while it stands still."""
@@ -164,6 +197,8 @@ class Track:
             view_count=fitted.view_count,
             shares=fitted.shares,
         )
+        if self._still_count < FEWEST_VIEWS_TO_CHECK:
+            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
         if not np.isfinite(bounds.gap_max):
             return replace(estimate, reason=UNBOUNDED)
         if interval.refused or not np.isfinite(fitted.gap):
