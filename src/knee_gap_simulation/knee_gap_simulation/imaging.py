@@ -85,3 +85,8 @@ def jpeg(image: ByteImage, quality: int) -> bytes:
     if not done:
         raise SimulationError("OpenCV could not encode the image as JPEG")
     return data.tobytes()
+
+
+def decoded(data: bytes) -> ByteImage:
+    """The image (h, w, 3) bgr8 of a JPEG."""
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), dtype=np.uint8)

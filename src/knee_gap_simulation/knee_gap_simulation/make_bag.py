@@ -2,37 +2,39 @@
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from heapq import merge
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from knee_gap_replay.errors import BagError
+from knee_gap_simulation.bench import FROM_SEED, Bench
+from knee_gap_simulation.clocks import image_times, stamp_ns, tracker_times
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.hardness import Hardness
 from knee_gap_simulation.imaging import Sensor, jpeg
 from knee_gap_simulation.lens import Lens
-from knee_gap_simulation.motion import HandMotion
-from knee_gap_simulation.recording import PARAMETERS_FILE, Sample, write_parameters, write_recording
+from knee_gap_simulation.motion import HandMotion, TravelDirection
+from knee_gap_simulation.recording import (
+    PARAMETERS_FILE,
+    Sample,
+    pose_samples,
+    write_parameters,
+    write_recording,
+)
 from knee_gap_simulation.render import ScopeCamera
-from knee_gap_simulation.rigid import FloatArray, inverse, transform
 from knee_gap_simulation.rims import RimScene
 from knee_gap_simulation.scope import Scope
-from knee_gap_simulation.tracker import TrackerNoise, tracked_body
+from knee_gap_simulation.tracker import track_lens, world_from_scene
 from knee_gap_simulation.truth import SceneTruth
-
-EPOCH_NS = 1_700_000_000_000_000_000
-TRACKER_HZ = 120.0
-POSE_MARGIN_S = 0.05
-# The tracker's clock is not the camera's: its samples fall between the images.
-TRACKER_PHASE_S = 0.0017
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What to record. Lengths [m], times [s]."""
+    """A recording of the simple scene of two rims. Lengths [m], times [s]."""
 
     gap: float = 0.004
     travel: float = 0.008
@@ -53,137 +55,196 @@ class Recording:
             raise SimulationError(f"the seed must not be negative, but is {self.seed}")
 
 
-def world_from_scene(seed: int) -> FloatArray:
-    """``T_world_scene`` (4, 4): a knee somewhere in the tracker's volume, turned anyhow."""
-    rng = np.random.default_rng([seed, 0x574F])
-    return transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5]))
-
-
-def image_times(recording: Recording) -> FloatArray:
-    """Exposure times (n,) [s] of the images."""
-    return np.arange(round(recording.duration_s * recording.fps)) / recording.fps
-
-
-def tracker_times(recording: Recording) -> FloatArray:
-    """Times (n,) [s] of the tracker: from 50 ms before the first image to 50 ms after the last."""
-    last = image_times(recording)[-1] + POSE_MARGIN_S
-    return np.arange(-POSE_MARGIN_S + TRACKER_PHASE_S, last, 1.0 / TRACKER_HZ)
-
-
-def hand_motion(recording: Recording) -> HandMotion:
-    """How the lens moves in the scene."""
-    return HandMotion(travel=recording.travel, depth=recording.depth, seed=recording.seed)
-
-
-def samples(
-    recording: Recording, truth: SceneTruth, motion: HandMotion, *, progress: bool = True
-) -> Iterator[Sample]:
-    """Everything that is recorded, in the order in which it would arrive."""
-    yield from merge(
-        _pose_samples(recording, truth, motion),
-        _image_samples(recording, truth, motion, progress=progress),
-        key=lambda sample: sample.record_ns,
-    )
-
-
-def _pose_samples(recording: Recording, truth: SceneTruth, motion: HandMotion) -> Iterator[Sample]:
-    times = tracker_times(recording)
-    T_world_lens = truth.T_world_scene @ motion.poses(np.maximum(times, 0.0))
-    T_body_lens = truth.scope.body_to_lens()
-    rng = np.random.default_rng([recording.seed, 0x5452])
-    reported = tracked_body(T_world_lens, T_body_lens, TrackerNoise(), rng)
-    true = T_world_lens @ inverse(T_body_lens)
-    for time, body, body_true in zip(times, reported, true, strict=True):
-        yield Sample(_stamp_ns(time), T_world_body=body, T_world_body_true=body_true)
-
-
-def _image_samples(
-    recording: Recording, truth: SceneTruth, motion: HandMotion, *, progress: bool
-) -> Iterator[Sample]:
-    sensor = Sensor(shot_noise=0.003, read_noise=0.0006)
-    camera = ScopeCamera(truth.scene, truth.lens, sensor=sensor, seed=recording.seed)
-    times = image_times(recording)
-    for time in _told(times, progress=progress):
-        T_scene_lens = motion.poses(time)
-        image = camera.frame(T_scene_lens, 1.0 / recording.fps)
-        yield Sample(
-            _stamp_ns(time),
-            jpeg=jpeg(image, recording.quality),
-            T_world_lens=truth.T_world_scene @ T_scene_lens,
-        )
-
-
-def _told(times: FloatArray, *, progress: bool) -> Iterable[float]:
-    """The times, with a progress bar on a terminal and a line every 60 images elsewhere."""
-    if sys.stderr.isatty():
-        return tqdm(times, desc="rendering", unit="image", disable=not progress)
-    return _told_in_lines(times) if progress else times
-
-
-def _told_in_lines(times: FloatArray) -> Iterator[float]:
-    for index, time in enumerate(times):
-        if index % 60 == 0:
-            print(f"rendering: image {index} of {len(times)}", file=sys.stderr)
-        yield time
-
-
-def _stamp_ns(time_s: float) -> int:
-    return EPOCH_NS + round(time_s * 1e9)
-
-
 def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> SceneTruth:
-    """Render a recording into a new bag at ``path`` and return its truth.
+    """Render a recording of the simple scene into a new bag at ``path`` and return its truth.
 
     Beside the data the folder gets ``scope.yaml``, the parameters of the tracking node. Raises
     SimulationError for a recording that cannot be made and BagError where the bag cannot be written.
     """
     scene = RimScene.random(recording.gap, recording.seed)
-    motion = hand_motion(recording)
+    motion = HandMotion(travel=recording.travel, depth=recording.depth, seed=recording.seed)
     truth = SceneTruth(scene, world_from_scene(recording.seed), Lens(), Scope())
-    metadata = truth.as_metadata(recording=vars(recording))
-    write_recording(path, samples(recording, truth, motion, progress=progress), truth.lens, metadata)
-    write_parameters(path / PARAMETERS_FILE, truth.scope)
+    times = tracker_times(recording.duration_s, recording.fps)
+    lenses = truth.T_world_scene @ motion.poses(times.clip(0.0))
+    bodies = track_lens(lenses, truth.scope.body_to_lens(), recording.seed)
+    _write(
+        path,
+        truth,
+        merge(
+            pose_samples(times, bodies, lenses, truth.scope),
+            _rim_images(recording, truth, motion, progress=progress),
+            key=lambda sample: sample.record_ns,
+        ),
+        recording=vars(recording),
+    )
     return truth
+
+
+def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTruth:
+    """Render a bench into a new bag at ``path``, as `make_bag` does, and return its truth."""
+    truth = SceneTruth(bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe)
+    times, bodies, lenses = bench.tracked_body_poses()
+    _write(
+        path,
+        truth,
+        merge(
+            pose_samples(times, bodies, lenses, bench.scope),
+            _knee_images(bench, progress=progress),
+            key=lambda sample: sample.record_ns,
+        ),
+        bench=bench.settings.as_dict(),
+    )
+    return truth
+
+
+def _write(path: Path, truth: SceneTruth, samples: Iterator[Sample], **settings: Any) -> None:
+    write_recording(path, samples, truth.lens, truth.as_metadata(**settings))
+    write_parameters(path / PARAMETERS_FILE, truth.scope)
+
+
+def _rim_images(
+    recording: Recording, truth: SceneTruth, motion: HandMotion, *, progress: bool
+) -> Iterator[Sample]:
+    sensor = Sensor(shot_noise=0.003, read_noise=0.0006)
+    assert isinstance(truth.scene, RimScene)
+    camera = ScopeCamera(truth.scene, truth.lens, sensor=sensor, seed=recording.seed)
+    times = image_times(recording.duration_s, recording.fps)
+    with _Told(len(times), progress=progress) as told:
+        for time in times:
+            T_scene_lens = motion.poses(time)
+            image = camera.frame(T_scene_lens, 1.0 / recording.fps)
+            told.one_more()
+            yield Sample(
+                stamp_ns(time),
+                jpeg=jpeg(image, recording.quality),
+                T_world_lens=truth.T_world_scene @ T_scene_lens,
+            )
+
+
+def _knee_images(bench: Bench, *, progress: bool) -> Iterator[Sample]:
+    with _Told(bench.frame_count, progress=progress) as told:
+        for frame in bench.frames():
+            told.one_more()
+            yield Sample(frame.stamp_ns, jpeg=frame.jpeg, T_world_lens=frame.T_world_lens)
+
+
+class _Told:
+    """Tells of rendered images: a bar on a terminal, a line every 60 images elsewhere."""
+
+    def __init__(self, count: int, *, progress: bool) -> None:
+        self._count, self._done, self._lines = count, 0, progress and not sys.stderr.isatty()
+        hidden = not progress or self._lines
+        self._bar = tqdm(total=count, desc="rendering", unit="image", disable=hidden)
+
+    def __enter__(self) -> "_Told":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def one_more(self) -> None:
+        """Count one image."""
+        self._bar.update()
+        self._done += 1
+        if self._lines and (self._done % 60 == 0 or self._done == self._count):
+            print(f"rendering: {self._done} of {self._count} images", file=sys.stderr)
+
+
+def hardness_argument(text: str) -> tuple[str, int]:
+    """A hardness and its level from NAME=LEVEL. Raises argparse.ArgumentTypeError."""
+    name, _, level = text.partition("=")
+    if not level.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=LEVEL, as debris=3")
+    try:
+        Hardness.at(0, {name: int(level)})
+    except SimulationError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return name, int(level)
 
 
 def _parser() -> argparse.ArgumentParser:
     defaults = Recording()
     parser = argparse.ArgumentParser(
         prog="make_bag",
-        description="Make a bag of a scene whose gap is known, seen by a tracked arthroscope.",
+        description="Make a bag of a scene whose gap is known, seen by a tracked arthroscope: two rims, "
+        "or with --level a knee.",
     )
     parser.add_argument("out", type=Path, help="folder of the new bag")
-    parser.add_argument("--gap-mm", type=float, default=1e3 * defaults.gap, help="distance of the rims")
+    parser.add_argument(
+        "--gap-mm",
+        type=float,
+        help="distance of the rims (4); in a knee the smallest distance (drawn from 3-8)",
+    )
+    parser.add_argument(
+        "--depth-mm", type=float, help="from the lens to the gap (10; in a knee drawn from 8-15)"
+    )
     parser.add_argument("--travel-mm", type=float, default=1e3 * defaults.travel, help="travel of the scope")
-    parser.add_argument(
-        "--depth-mm", type=float, default=1e3 * defaults.depth, help="from the lens to the gap"
-    )
     parser.add_argument("--seed", type=int, default=defaults.seed, help="the same seed gives the same bag")
-    parser.add_argument(
-        "--duration-s", type=float, default=defaults.duration_s, help="length of the recording"
-    )
+    parser.add_argument("--duration-s", type=float, help="length of the recording (6; a knee 4)")
     parser.add_argument("--fps", type=float, default=defaults.fps, help="images a second")
-    parser.add_argument("--quality", type=int, default=defaults.quality, help="of the JPEG images, 1-100")
+    parser.add_argument("--quality", type=int, help="of the JPEG images of the rims, 1-100 (60)")
+    parser.add_argument("--level", type=int, choices=range(4), help="a knee, this hard to see")
+    parser.add_argument(
+        "--hardness",
+        type=hardness_argument,
+        action="append",
+        default=[],
+        metavar="NAME=LEVEL",
+        help=f"of a knee, one by one: {', '.join(Hardness.__dataclass_fields__)}",
+    )
+    parser.add_argument(
+        "--travel-direction", choices=[str(d) for d in TravelDirection], help="in a knee (along the gap)"
+    )
+    parser.add_argument("--no-gap", action="store_true", help="a knee that is closed: no gap is to be found")
     return parser
+
+
+def _knee(arguments: argparse.Namespace) -> Bench:
+    if arguments.quality is not None:
+        raise SimulationError("--quality is for the rims; a knee's JPEG quality follows its noise level")
+    if arguments.no_gap and arguments.gap_mm is not None:
+        raise SimulationError("--no-gap and --gap-mm exclude each other")
+    gap = FROM_SEED if arguments.gap_mm is None else 1e-3 * arguments.gap_mm
+    return Bench(
+        arguments.level or 0,
+        arguments.seed,
+        arguments.travel_direction or TravelDirection.ALONG,
+        gap=None if arguments.no_gap else gap,
+        depth=FROM_SEED if arguments.depth_mm is None else 1e-3 * arguments.depth_mm,
+        travel=1e-3 * arguments.travel_mm,
+        duration_s=4.0 if arguments.duration_s is None else arguments.duration_s,
+        fps=arguments.fps,
+        hardness=dict(arguments.hardness),
+    )
+
+
+def _rims(arguments: argparse.Namespace) -> Recording:
+    defaults = Recording()
+    return Recording(
+        gap=defaults.gap if arguments.gap_mm is None else 1e-3 * arguments.gap_mm,
+        travel=1e-3 * arguments.travel_mm,
+        depth=defaults.depth if arguments.depth_mm is None else 1e-3 * arguments.depth_mm,
+        seed=arguments.seed,
+        duration_s=defaults.duration_s if arguments.duration_s is None else arguments.duration_s,
+        fps=arguments.fps,
+        quality=defaults.quality if arguments.quality is None else arguments.quality,
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a bag; 0 when it is made."""
     arguments = _parser().parse_args(argv)
+    of_a_knee = arguments.hardness or arguments.no_gap or arguments.travel_direction
     try:
-        recording = Recording(
-            gap=1e-3 * arguments.gap_mm,
-            travel=1e-3 * arguments.travel_mm,
-            depth=1e-3 * arguments.depth_mm,
-            seed=arguments.seed,
-            duration_s=arguments.duration_s,
-            fps=arguments.fps,
-            quality=arguments.quality,
-        )
-        make_bag(arguments.out, recording)
+        if arguments.out.exists():
+            raise BagError(f"{arguments.out} exists already; choose another name or remove it")
+        if arguments.level is not None or of_a_knee:
+            make_knee_bag(arguments.out, _knee(arguments))
+        else:
+            make_bag(arguments.out, _rims(arguments))
     except (SimulationError, BagError) as error:
         print(f"make_bag: {error}", file=sys.stderr)
         return 1
     size = sum(file.stat().st_size for file in arguments.out.iterdir()) / 1e6
-    print(f"{arguments.out}: {recording.duration_s:g} s, {size:.1f} MB")
+    print(f"{arguments.out}: {size:.1f} MB")
     return 0

@@ -1,6 +1,6 @@
 """A simulated recording as a bag: pictures, camera, tracked and true poses, the scene in the metadata."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,9 @@ from ruamel.yaml import YAML
 
 from knee_gap_replay.bag import BagWriter
 from knee_gap_replay.types import blank
+from knee_gap_simulation.clocks import stamp_ns
 from knee_gap_simulation.lens import Lens
-from knee_gap_simulation.rigid import FloatArray, quaternion_xyzw
+from knee_gap_simulation.rigid import FloatArray, inverse, quaternion_xyzw
 from knee_gap_simulation.scope import Scope
 
 IMAGE = "/knee_gap/image_raw/compressed"
@@ -42,6 +43,15 @@ class Sample:
     def record_ns(self) -> int:
         """When a recorder would have received it."""
         return self.stamp_ns + (POSE_LATENCY_NS if self.jpeg is None else IMAGE_LATENCY_NS)
+
+
+def pose_samples(
+    times: FloatArray, T_world_body: FloatArray, T_world_lens: FloatArray, scope: Scope
+) -> Iterator[Sample]:
+    """The tracker's samples at times (n,) [s]: reported bodies (n, 4, 4), those of true lenses (n, 4, 4)."""
+    true = T_world_lens @ inverse(scope.body_to_lens())
+    for time, body, body_true in zip(times, T_world_body, true, strict=True):
+        yield Sample(stamp_ns(time), T_world_body=body, T_world_body_true=body_true)
 
 
 def write_recording(path: Path, samples: Iterable[Sample], lens: Lens, metadata: dict[str, str]) -> None:

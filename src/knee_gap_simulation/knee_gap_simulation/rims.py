@@ -118,10 +118,10 @@ class RimScene:
             rims.append(np.stack([along, y, z], axis=-1))
         return rims[0], rims[1]
 
-    @staticmethod
-    def is_gap(surfaces: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-        """Whether what a ray met (n,) lies behind the gap."""
-        return np.asarray(surfaces == WALL)
+    def looks_into_gap(self, T_scene_lens: FloatArray, bearings: FloatArray) -> npt.NDArray[np.bool_]:
+        """Whether bearings (n, 3) of a lens look into the gap."""
+        directions = np.ascontiguousarray(bearings @ T_scene_lens[:3, :3].T)
+        return np.asarray(self.cast(T_scene_lens[:3, 3].copy(), directions)[3] == WALL)
 
     def _constants(self) -> FloatArray:
         return np.array([self.gap, self.end_share, self.opening, self.slope, self.bend, self.wall])

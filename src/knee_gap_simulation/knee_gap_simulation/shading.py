@@ -18,8 +18,9 @@ class Light:
 
     ``position`` [m] is in the lens frame. ``spread`` is the exponent of the cosine with which it falls off
     to the side. ``reference`` [m] is the distance where it gives unit irradiance; ``absorption`` [1/m] of
-    the fluid dims what is far away, on the way there and back; ``glare`` scales the mirror-like reflection
-    of the wet surface.
+    the fluid dims what is far away, on the way there and back; ``ambient`` is what the joint scatters.
+    ``glare`` scales the mirror-like reflection of the wet surface, ``shininess`` is its exponent, ``glint``
+    how much the relief scatters it, ``sheen`` the share of its wide part.
     """
 
     position: tuple[float, float, float] = (0.0004, -0.0014, -0.0002)
@@ -29,6 +30,8 @@ class Light:
     glare: float = 0.7
     shininess: float = 140.0
     ambient: float = 0.004
+    glint: float = 1.0
+    sheen: float = 0.0
 
 
 def shade(
@@ -39,40 +42,48 @@ def shade(
     textures: FloatImage,
     T_scene_lens: FloatArray,
     light: Light,
+    reach: FloatArray | None = None,
 ) -> FloatImage:
     """Linear radiance (n, 3), blue green red, of surface points seen from the lens.
 
     points, normals: (n, 3) in the scene frame; uv: (n, 2) [m] on the surface; surfaces: (n,) index into
-    ``textures`` (k, size, size, channels), NOTHING where the ray met nothing.
+    ``textures`` (k, size, size, channels), NOTHING where the ray met nothing; reach: (n, 2) share of the
+    light of the lamp, and of the light from all around, that gets there (all of it by default).
     """
     eye = T_scene_lens[:3, 3]
     lamp = T_scene_lens[:3, :3] @ np.asarray(light.position) + eye
     constants = np.array(
-        [light.spread, light.reference, light.absorption, light.glare, light.shininess, light.ambient]
+        [
+            *(light.spread, light.reference, light.absorption, light.glare, light.shininess),
+            *(light.ambient, light.glint, light.sheen),
+        ]
     )
     result = np.empty((len(points), 3), np.float32)
     axis = np.ascontiguousarray(T_scene_lens[:3, 2])
-    _shade(points, normals, uv, surfaces, textures, eye, lamp, axis, constants, result)
+    if reach is None:
+        reach = np.ones((len(points), 2))
+    _shade(points, normals, uv, surfaces, textures, reach, eye, lamp, axis, constants, result)
     return result
 
 
 NOTHING = np.uint8(255)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _shade(
     points: FloatArray,
     normals: FloatArray,
     uv: FloatArray,
     surfaces: npt.NDArray[np.uint8],
     textures: FloatImage,
+    reach: FloatArray,
     eye: FloatArray,
     lamp: FloatArray,
     axis: FloatArray,
     constants: FloatArray,
     result: FloatImage,
 ) -> None:
-    spread, reference, absorption, glare, shininess, ambient = constants
+    spread, reference, absorption, glare, shininess, ambient, glint, sheen = constants
     size = textures.shape[1]
     texel = np.empty(textures.shape[3])
     for i in range(len(points)):
@@ -102,14 +113,19 @@ def _shade(
 
         ahead = max(0.0, -(lx * axis[0] + ly * axis[1] + lz * axis[2]))
         beam = ahead**spread * (reference / to_light) ** 2 * np.exp(-absorption * (to_light + to_eye))
+        beam *= reach[i, 0]
         # Light that scatters under the surface reaches a little beyond the terminator.
         facing = max(0.0, (bx * lx + by * ly + bz * lz + 0.12) / 1.12)
         hx, hy, hz = lx + ex, ly + ey, lz + ez
         scale = 1.0 / np.sqrt(hx * hx + hy * hy + hz * hz)
-        mirror = max(0.0, (bx * hx + by * hy + bz * hz) * scale)
-        shine = glare * texel[5] * mirror**shininess * beam
+        mx = nx - glint * (texel[3] * ux + texel[4] * vx)
+        my = ny - glint * (texel[3] * uy + texel[4] * vy)
+        mz = nz - glint * (texel[3] * uz + texel[4] * vz)
+        scale /= np.sqrt(mx * mx + my * my + mz * mz)
+        mirror = max(0.0, (mx * hx + my * hy + mz * hz) * scale)
+        shine = glare * texel[5] * (mirror**shininess + sheen * mirror**8.0) * beam
         for channel in range(3):
-            result[i, channel] = texel[channel] * (beam * facing + ambient) + shine
+            result[i, channel] = texel[channel] * (beam * facing + ambient * reach[i, 1]) + shine
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

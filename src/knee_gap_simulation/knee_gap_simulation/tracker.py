@@ -42,3 +42,17 @@ def tracked_body(
     noisy = T_world_lens @ transform(turn, np.zeros((count, 3)))
     noisy[:, :3, 3] += shift
     return noisy @ inverse(T_body_lens)
+
+
+def track_lens(
+    T_world_lens: FloatArray, T_body_lens: FloatArray, seed: int, noise: TrackerNoise | None = None
+) -> FloatArray:
+    """What the tracker reports (n, 4, 4) of the body for true lens poses, its noise drawn from a seed."""
+    rng = np.random.default_rng([seed, 0x5452])
+    return tracked_body(T_world_lens, T_body_lens, noise or TrackerNoise(), rng)
+
+
+def world_from_scene(seed: int) -> FloatArray:
+    """``T_world_scene`` (4, 4): a knee somewhere in the tracker's volume, turned anyhow."""
+    rng = np.random.default_rng([seed, 0x574F])
+    return transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5]))

@@ -1,0 +1,98 @@
+"""`contact_sheet`: the knee at levels 0 to 3 in one picture, beside real frames where there are any."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from knee_gap_simulation.bench import Bench
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.hardness import LEVELS
+from knee_gap_simulation.imaging import ByteImage
+
+_SIZE_PX = 400
+_LABEL_PX = 34
+# Seconds into each level's recording: the probe is there at some, and away at others.
+_MOMENTS_S = (1.0, 2.2, 3.0, 1.4)
+
+
+def contact_sheet(seeds: Sequence[int], real: Sequence[ByteImage] = ()) -> ByteImage:
+    """One row of levels 0 to 3 for each seed, and rows of real frames (h, w, 3) below."""
+    rows = [_label([f"level {level}" for level in LEVELS])]
+    for seed in tqdm(seeds, desc="rendering", unit="seed", disable=not sys.stderr.isatty()):
+        rows.append(np.hstack([_tile(_moment(level, seed)) for level in LEVELS]))
+    if real:
+        rows.append(_label(["real endoscopes"]))
+    for first in range(0, len(real), len(LEVELS)):
+        tiles = [_tile(image) for image in real[first : first + len(LEVELS)]]
+        tiles += [np.zeros_like(tiles[0])] * (len(LEVELS) - len(tiles))
+        rows.append(np.hstack(tiles))
+    return np.vstack(rows)
+
+
+def read_frames(path: Path, count: int = 4) -> list[ByteImage]:
+    """Frames (h, w, 3), evenly spread, of a video, a folder of pictures, or one picture.
+
+    Raises SimulationError where there is none.
+    """
+    pictures = sorted(p for p in path.iterdir() if p.suffix in (".jpg", ".png")) if path.is_dir() else [path]
+    frames = [image for picture in pictures if (image := cv2.imread(str(picture))) is not None]
+    # A mask or an empty frame has hardly any shades.
+    frames = [image for image in frames if len(np.unique(image[::8, ::8])) > 32]
+    if not frames and path.is_file():
+        video = cv2.VideoCapture(str(path))
+        while (read := video.read())[0]:
+            frames.append(read[1])
+    if not frames:
+        raise SimulationError(f"{path} holds no picture and no video")
+    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
+    return [np.asarray(frames[index], dtype=np.uint8) for index in chosen]
+
+
+def _moment(level: int, seed: int) -> ByteImage:
+    bench = Bench(level, seed)
+    index = round(_MOMENTS_S[level] * bench.settings.fps)
+    return next(bench.frames(index, index + 1)).image
+
+
+def _tile(image: ByteImage) -> ByteImage:
+    """The middle square of a picture."""
+    height, width = image.shape[:2]
+    left = max(0, (width - height) // 2)
+    square = image[:, left : left + min(height, width)]
+    return np.asarray(cv2.resize(square, (_SIZE_PX, _SIZE_PX), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _label(texts: Sequence[str]) -> ByteImage:
+    strip = np.full((_LABEL_PX, _SIZE_PX * len(LEVELS), 3), 24, np.uint8)
+    for index, text in enumerate(texts):
+        place = (index * _SIZE_PX + 12, _LABEL_PX - 10)
+        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, (225, 225, 225), 1, cv2.LINE_AA)
+    return strip
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write a contact sheet; 0 when it is written."""
+    parser = argparse.ArgumentParser(prog="contact_sheet", description=__doc__)
+    parser.add_argument("out", type=Path, help="picture to write, .png or .jpg")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[4, 2, 11], help="knees to show, one a row")
+    parser.add_argument(
+        "--beside", type=Path, nargs="*", default=[], help="real frames: pictures, folders of them, or videos"
+    )
+    arguments = parser.parse_args(argv)
+    try:
+        real = [frame for path in arguments.beside for frame in read_frames(path)]
+        sheet = contact_sheet(arguments.seeds, real)
+    except (SimulationError, OSError) as error:
+        print(f"contact_sheet: {error}", file=sys.stderr)
+        return 1
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(arguments.out), sheet):
+        print(f"contact_sheet: {arguments.out} cannot be written as a picture", file=sys.stderr)
+        return 1
+    print(arguments.out)
+    return 0
