@@ -21,10 +21,7 @@ def page() -> Iterator[str]:
     """Yield the lines of the page."""
     yield "# Parameters"
     yield ""
-    yield (
-        "Printed by `tools/env python -m knee_gap_bringup.parameters_page`. All are read-only once a node runs; "
-        "SI units."
-    )
+    yield ("Printed by `tools/env python -m knee_gap_bringup.parameters_page`. They are read-only; SI units.")
     for node, kinds in NODES.items():
         yield ""
         yield f"## {node}"
