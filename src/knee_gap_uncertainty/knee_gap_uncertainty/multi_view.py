@@ -19,9 +19,10 @@ from knee_gap_uncertainty.views import Views
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Squared length of a bearing's residual, in standard deviations, that 1 in 1000 exceeds (chi-square, 2
-# degrees).
-GATE = 13.8
+# Squared length of a bearing's residual, in standard deviations, that 5 in 1000 exceed by chance (chi-square
+# with 2 degrees of freedom). A bad bearing just below it moves the gap little; the price of the good ones
+# above it is 3 % of variance where no error is common, and is in the covariance.
+GATE = 10.6
 # With fewer views a bad bearing pulls the fit to itself, and neither it nor the scale of the errors can be
 # told.
 FEWEST_VIEWS_TO_GATE = 5
@@ -208,6 +209,8 @@ def fit_arrays(
         cost = maximise(measured, used, unknowns, out, inverse)
     covariance = np.zeros((6, 6))
     expected = considered_covariance(out, common_share, inverse, covariance)
+    if count >= FEWEST_VIEWS_TO_GATE:
+        covariance *= price_of_gate(common_share)
     shares = variance_shares(measured, out, unknowns, common_share, inverse)
     dof = -6.0
     for i in range(count):
@@ -219,6 +222,16 @@ def fit_arrays(
         scale += min(max(ramp, 0.0), 1.0) * (ratio - 1.0)
         covariance *= scale
     return Fitted(centre, measured.frames, unknowns, covariance, used, residuals, ratio, scale, shares)
+
+
+@compiled
+def price_of_gate(common_share: float) -> float:
+    """Factor of the variance where good bearings beyond the gate are given up: 1 / P(chi-square_4 < gate).
+
+    Residuals are of the independent part, the gate is set by the whole.
+    """
+    half = 0.5 * GATE / max(1.0 - common_share, 1e-3)
+    return float(1.0 / (1.0 - np.exp(-half) * (1.0 + half)))
 
 
 @compiled

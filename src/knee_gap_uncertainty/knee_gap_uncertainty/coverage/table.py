@@ -114,8 +114,8 @@ def _coverage_line(name: str, rows: Sequence[Row]) -> str:
 def _named(row: Row) -> str:
     return (
         f"{100 * row.coverage:.2f} %: depth {row.depth_mm:g}, gap {row.gap_mm:g}, "
-        f"travel {row.travel_mm:g} mm at {row.direction_deg} deg, {row.errors}, N = {row.views}, {row.share}, {row.noise}, "
-        f"{100 * row.accepted:.1f} % accepted"
+        f"travel {row.travel_mm:g} mm at {row.direction_deg} deg, {row.errors}, N = {row.views}, "
+        f"{row.share}, {row.noise}, {100 * row.accepted:.1f} % accepted"
     )
 
 
