@@ -33,6 +33,7 @@ from knee_gap_simulation.scope import Scope
 from knee_gap_simulation.tracker import TrackerNoise, tracked_body
 
 STEP = "/knee_gap/calibration_step"
+SHAFT_POSE = "/knee_gap/scope_shaft/pose"
 EPOCH_NS = 1_700_000_000_000_000_000
 TRACKER_HZ = 120.0
 TRACKER_PHASE_S = 0.0017
@@ -203,7 +204,7 @@ def make_calibration_bag(
     }
     with BagWriter(path, metadata=metadata) as bag:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage", "sensor")
-        for topic in (BODY_POSE, BODY_POSE_TRUE, LENS_POSE_TRUE):
+        for topic in (BODY_POSE, BODY_POSE_TRUE, LENS_POSE_TRUE, SHAFT_POSE):
             bag.add_topic(topic, "geometry_msgs/msg/PoseStamped", "sensor")
         bag.add_topic(STEP, "std_msgs/msg/String", "reliable")
         messages = [*_steps(motion, chosen), *_poses(motion, chosen, truth)]
@@ -264,8 +265,16 @@ def _poses(
     T_body_lens = truth.scope.body_to_lens(0.0)
     rng = np.random.default_rng([recording.seed, 0x5452])
     reported = tracked_body(true @ T_body_lens, T_body_lens, recording.noise, rng)
-    for time, body, body_true in zip(times, reported, true, strict=True):
+    # A second body, on the light post: it turns with the scope, the first stays with the camera head.
+    shaft = truth.scope.scope.body_to_shaft()
+    post = shaft @ transform([0.3, 0.2, 0.1], [0.04, 0.0, -0.15])
+    turns = np.array([motion.turn(time) for time in times])
+    turned = transform(turns[:, None] * [0.0, 0.0, 1.0], np.zeros((len(times), 3)))
+    posts = true @ shaft @ turned @ inverse(shaft) @ post
+    posts = tracked_body(posts, np.eye(4), recording.noise, rng)
+    for time, body, body_true, post in zip(times, reported, true, posts, strict=True):
         stamp_ns = _stamp_ns(time)
+        yield stamp_ns + POSE_LATENCY_NS, SHAFT_POSE, pose_message(post, stamp_ns)
         yield stamp_ns + POSE_LATENCY_NS, BODY_POSE, pose_message(body, stamp_ns)
         yield stamp_ns + POSE_LATENCY_NS, BODY_POSE_TRUE, pose_message(body_true, stamp_ns)
 

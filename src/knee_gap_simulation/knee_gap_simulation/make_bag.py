@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.bench import FROM_SEED, Bench
+from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
 from knee_gap_simulation.clocks import image_times, stamp_ns, tracker_times
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import Hardness
@@ -181,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--travel-mm", type=float, default=1e3 * defaults.travel, help="travel of the scope")
     parser.add_argument("--seed", type=int, default=defaults.seed, help="the same seed gives the same bag")
     parser.add_argument("--duration-s", type=float, help="length of the recording (6; a knee 4)")
-    parser.add_argument("--fps", type=float, default=defaults.fps, help="images a second")
+    parser.add_argument("--fps", type=float, help="images a second (60; to calibrate from, 30)")
     parser.add_argument("--quality", type=int, help="of the JPEG images of the rims, 1-100 (60)")
     parser.add_argument("--level", type=int, choices=range(4), help="a knee, this hard to see")
     parser.add_argument(
@@ -196,6 +197,10 @@ def _parser() -> argparse.ArgumentParser:
         "--travel-direction", choices=[str(d) for d in TravelDirection], help="in a knee (along the gap)"
     )
     parser.add_argument("--no-gap", action="store_true", help="a knee that is closed: no gap is to be found")
+    parser.add_argument("--calibration", action="store_true", help="a board and pivoting, to calibrate from")
+    parser.add_argument(
+        "--video-delay-ms", type=float, help="how late the images to calibrate from are stamped (12)"
+    )
     return parser
 
 
@@ -204,6 +209,7 @@ def _knee(arguments: argparse.Namespace) -> Bench:
         raise SimulationError("--quality is for the rims; a knee's JPEG quality follows its noise level")
     if arguments.no_gap and arguments.gap_mm is not None:
         raise SimulationError("--no-gap and --gap-mm exclude each other")
+    defaults = Recording()
     gap = FROM_SEED if arguments.gap_mm is None else 1e-3 * arguments.gap_mm
     return Bench(
         arguments.level or 0,
@@ -213,7 +219,7 @@ def _knee(arguments: argparse.Namespace) -> Bench:
         depth=FROM_SEED if arguments.depth_mm is None else 1e-3 * arguments.depth_mm,
         travel=1e-3 * arguments.travel_mm,
         duration_s=4.0 if arguments.duration_s is None else arguments.duration_s,
-        fps=arguments.fps,
+        fps=defaults.fps if arguments.fps is None else arguments.fps,
         hardness=dict(arguments.hardness),
     )
 
@@ -226,9 +232,31 @@ def _rims(arguments: argparse.Namespace) -> Recording:
         depth=defaults.depth if arguments.depth_mm is None else 1e-3 * arguments.depth_mm,
         seed=arguments.seed,
         duration_s=defaults.duration_s if arguments.duration_s is None else arguments.duration_s,
-        fps=arguments.fps,
+        fps=defaults.fps if arguments.fps is None else arguments.fps,
         quality=defaults.quality if arguments.quality is None else arguments.quality,
     )
+
+
+def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
+    others = (arguments.level, arguments.gap_mm, arguments.depth_mm, arguments.travel_direction)
+    if arguments.no_gap or arguments.hardness or any(value is not None for value in others):
+        raise SimulationError("--calibration shows a board: there is no gap, knee or depth to choose")
+    defaults = CalibrationRecording()
+    delay_ms = 1e3 * defaults.video_delay if arguments.video_delay_ms is None else arguments.video_delay_ms
+    return CalibrationRecording(
+        seed=arguments.seed,
+        fps=defaults.fps if arguments.fps is None else arguments.fps,
+        board_s=defaults.board_s if arguments.duration_s is None else arguments.duration_s,
+        video_delay=1e-3 * delay_ms,
+        quality=defaults.quality if arguments.quality is None else arguments.quality,
+    )
+
+
+def _told_times(times: Iterator[float], count: int) -> Iterator[float]:
+    with _Told(count, progress=True) as told:
+        for time in times:
+            told.one_more()
+            yield time
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -238,7 +266,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if arguments.out.exists():
             raise BagError(f"{arguments.out} exists already; choose another name or remove it")
-        if arguments.level is not None or of_a_knee:
+        if arguments.calibration:
+            make_calibration_bag(arguments.out, _calibration(arguments), _told_times)
+        elif arguments.level is not None or of_a_knee:
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))

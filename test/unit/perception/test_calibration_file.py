@@ -20,6 +20,7 @@ from knee_gap_perception.calibration.lens_error import lens_covariance, lens_err
 from knee_gap_perception.calibration.rigid import from_vector, to_vector
 from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.tracking import TrackingParameters
 
 
 def covariance(size: int, scale: float) -> np.ndarray:  # type: ignore[type-arg]
@@ -108,6 +109,11 @@ def test_images_of_another_size_are_refused() -> None:
         WHOLE.require_image_size(1920, 1080)
     with pytest.raises(PerceptionError, match="1280x720"):
         WHOLE.with_parts(640, 480, tip=None)
+
+
+def test_the_tracking_node_gets_the_same_lens() -> None:
+    parameters = TrackingParameters(**WHOLE.tracking_parameters())  # type: ignore[arg-type]
+    assert parameters.body_to_lens() == pytest.approx(WHOLE.body_to_lens())
 
 
 def test_the_notch_tells_the_turn() -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.calibration.intrinsics import Intrinsics
 from knee_gap_perception.calibration.rigid import Array, rigid
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turned_lens
+from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turn_between, turned_lens
 from knee_gap_perception.errors import PerceptionError
 
 FORMAT = "knee_gap_calibration 1"
@@ -45,12 +45,17 @@ class LensOnBody:
 
 @dataclass(frozen=True)
 class Oblique:
-    """Where the notch stood at the calibrated turn [rad], the shaft's axis, and its standard deviations."""
+    """What tells the turn of the scope in its camera head: the shaft's axis, and where it was calibrated.
+
+    `notch_angle` [rad] is where the notch stood, NaN where it was not seen; `T_head_scope` (4, 4) where a
+    second tracked body on the scope stood against the one on the camera head, None without one.
+    """
 
     notch_angle: float
     axis: ShaftAxis | None
     axis_tilt_sigma: float
     axis_shift_sigma: float
+    T_head_scope: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -119,15 +124,38 @@ class Calibration:
             lens.T_body_lens, scope_turn, lens.mount, self.oblique.axis if self.oblique else None
         )
 
+    def tracking_parameters(self) -> dict[str, list[float] | float]:
+        """What of this goes into `tracking_node`'s parameters, by their names.
+
+        Raises PerceptionError where the lens was not calibrated.
+        """
+        lens = self.require_lens()
+        return {
+            "body_to_shaft_translation": _numbers(lens.translation),
+            "body_to_shaft_quaternion_xyzw": _numbers(lens.quaternion_xyzw),
+            "oblique_angle": 0.0,
+        }
+
     def scope_turn(self, notch_angle: float) -> float:
         """Turn [rad], in (-pi, pi], that a notch seen at an angle [rad] says.
 
         Raises PerceptionError where the notch was not calibrated.
         """
-        if self.oblique is None:
+        if self.oblique is None or not np.isfinite(self.oblique.notch_angle):
             raise PerceptionError("the calibration does not know the notch: run calibrate oblique")
         turn = (notch_angle - self.oblique.notch_angle + np.pi) % (2 * np.pi) - np.pi
         return float(turn)
+
+    def scope_turn_of_body(self, T_head_scope: Array) -> float:
+        """Turn [rad] that a second body on the scope says, from its pose (4, 4) in the frame of the first.
+
+        Raises PerceptionError where the second body was not calibrated.
+        """
+        if self.oblique is None or self.oblique.T_head_scope is None or self.oblique.axis is None:
+            raise PerceptionError(
+                "the calibration knows no second body on the scope: run calibrate oblique --scope-pose-topic"
+            )
+        return turn_between(self.oblique.T_head_scope, T_head_scope, self.oblique.axis.direction)
 
     def with_parts(self, width_px: int, height_px: int, **parts: Any) -> "Calibration":
         """The calibration with some parts replaced. Raises PerceptionError for another image size."""
@@ -212,6 +240,8 @@ def _to_dict(calibration: Calibration) -> dict[str, Any]:
             "axis_point": _numbers(oblique.axis.point) if oblique.axis else None,
             "axis_tilt_sigma": oblique.axis_tilt_sigma,
             "axis_shift_sigma": oblique.axis_shift_sigma,
+            # Rounding a rotation matrix to a quaternion and back would change the hash.
+            "T_head_scope": _numbers(oblique.T_head_scope) if oblique.T_head_scope is not None else None,
         }
     if tip is not None:
         content["tip"] = {
@@ -274,7 +304,9 @@ def _oblique(values: dict[str, Any]) -> Oblique:
     if values["axis_direction"] is not None:
         axis = ShaftAxis(_array(values["axis_direction"], 3), _array(values["axis_point"], 3))
     sigmas = float(values["axis_tilt_sigma"]), float(values["axis_shift_sigma"])
-    return Oblique(float(values["notch_angle"]), axis, *sigmas)
+    second = values["T_head_scope"]
+    T_head_scope = _array(second, 4, 4) if second is not None else None
+    return Oblique(float(values["notch_angle"]), axis, *sigmas, T_head_scope)
 
 
 def _tip(values: dict[str, Any]) -> Tip:

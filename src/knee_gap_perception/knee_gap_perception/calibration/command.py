@@ -12,7 +12,8 @@ from tqdm import tqdm
 from knee_gap_perception.calibration.boards import BOARD_SYNTAX, board_from_text
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration, save_calibration
 from knee_gap_perception.calibration.lens_model import NAMES, LensModel
-from knee_gap_perception.calibration.procedure import Procedure, Request
+from knee_gap_perception.calibration.procedure import Procedure
+from knee_gap_perception.calibration.recording import Recording, Request
 from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
 
@@ -20,7 +21,7 @@ STEPS = {
     "intrinsics": "focal lengths, principal point and distortion, from a board",
     "time_offset": "time between video and tracker, from any textured scene",
     "hand_eye": "the lens on the tracked body, from a board that stands still",
-    "oblique": "hand_eye, and the axis about which an oblique scope turns in its camera head, from its notch",
+    "oblique": "hand_eye, and the axis about which an oblique scope turns, from its notch or a second body",
     "pivot": "the scope's tip on the tracked body, from pivoting about it",
     "all": "every step that the bag has data for",
 }
@@ -39,6 +40,9 @@ def _parser() -> argparse.ArgumentParser:
         step.add_argument("--board", metavar="BOARD", help=BOARD_SYNTAX)
         step.add_argument("--image-topic", default=defaults.image_topic)
         step.add_argument("--pose-topic", default=defaults.pose_topic)
+        step.add_argument(
+            "--scope-pose-topic", help="second tracked body, on the scope: instead of the notch"
+        )
         step.add_argument("--model", choices=list(NAMES), default=defaults.model.distortion_model)
         step.add_argument("--high-order", action="store_true", help="fit the high distortion terms too")
         step.add_argument("--mount", choices=[str(m) for m in Mount], default=str(defaults.mount))
@@ -52,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         step.add_argument("--end", type=float, default=float("inf"), metavar="S")
     show = steps.add_parser("show", help="what a calibration says, and its hash")
     show.add_argument("file", type=Path)
+    show.add_argument("--parameters", action="store_true", help="as parameters of tracking_node, to paste")
     return parser
 
 
@@ -60,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         if arguments.step == "show":
-            _show(load_calibration(arguments.file))
+            calibration = load_calibration(arguments.file)
+            _show_parameters(calibration) if arguments.parameters else _show(calibration)
         else:
             _calibrate(arguments)
     except (PerceptionError, SerdeError) as error:
@@ -75,6 +81,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         board=board_from_text(arguments.board) if arguments.board else None,
         image_topic=arguments.image_topic,
         pose_topic=arguments.pose_topic,
+        scope_pose_topic=arguments.scope_pose_topic,
         model=LensModel(arguments.model, arguments.high_order),
         mount=Mount(arguments.mount),
         views=arguments.views,
@@ -84,9 +91,10 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         begin=arguments.begin,
         end=arguments.end,
     )
-    procedure = Procedure(request, lambda line: print(f"  {line}", flush=True), _progress)
+    recording = Recording(request, _progress)
+    procedure = Procedure(recording, lambda line: print(f"  {line}", flush=True))
     calibration = load_calibration(arguments.into) if arguments.into.exists() else None
-    for step in _chosen(arguments.step, procedure):
+    for step in _chosen(arguments.step, recording):
         print(step, flush=True)
         calibration = getattr(procedure, step)(calibration)
     if calibration is not None:
@@ -94,11 +102,11 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         print(f"{arguments.into}: hash {calibration.hash[:12]}")
 
 
-def _chosen(step: str, procedure: Procedure) -> list[str]:
+def _chosen(step: str, recording: Recording) -> list[str]:
     """The steps to take: one, or all that the bag marks; in an unmarked bag, those of a board."""
     if step != "all":
         return [step]
-    marked = procedure.steps
+    marked = recording.steps
     lens = "oblique" if "oblique" in marked else "hand_eye"
     return ["time_offset", "intrinsics", lens, *(["pivot"] if "pivot" in marked else [])]
 
@@ -114,6 +122,12 @@ def _progress(items: Iterable[int], text: str) -> Iterable[int]:
         if index in marks:
             print(f"  {text}: {marks[index]} % of {len(known)} images", file=sys.stderr, flush=True)
         yield item
+
+
+def _show_parameters(calibration: Calibration) -> None:
+    print("/**:\n  ros__parameters:")
+    for name, value in calibration.tracking_parameters().items():
+        print(f"    {name}: {value}")
 
 
 def _show(calibration: Calibration) -> None:

@@ -1,85 +1,43 @@
 """The steps of a calibration: each from a recorded bag to its part of the calibration, told in words."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.calibration.bag_input import CalibrationBag
-from knee_gap_perception.calibration.boards import Board, DotGrid
+from knee_gap_perception.calibration.boards import DotGrid
 from knee_gap_perception.calibration.calibration_file import Calibration, Clock, LensOnBody, Oblique, Tip
 from knee_gap_perception.calibration.hand_eye import HandEye, HandEyeSettings, calibrate_hand_eye
 from knee_gap_perception.calibration.image_motion import image_motion
 from knee_gap_perception.calibration.intrinsics import IntrinsicsFit, fit_intrinsics
 from knee_gap_perception.calibration.lens_model import LensModel
 from knee_gap_perception.calibration.notch import NOTCH_SIGMA
-from knee_gap_perception.calibration.observations import (
-    Observations,
-    common_angle,
-    observe,
-    still_stamps,
-    tracked_views,
-    wrapped,
-)
+from knee_gap_perception.calibration.observations import Observations, common_angle, tracked_views, wrapped
+from knee_gap_perception.calibration.observed_turns import FIXED_TURN, turns_by_body, turns_by_notch
 from knee_gap_perception.calibration.pivot import calibrate_pivot
-from knee_gap_perception.calibration.pose_track import PoseTrack
+from knee_gap_perception.calibration.recording import Recording
 from knee_gap_perception.calibration.rigid import Array
-from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.calibration.time_offset import estimate_time_offset
 from knee_gap_perception.errors import PerceptionError
 
-FIXED_TURN = np.radians(2.0)  # turns of the scope that `hand_eye`, which takes it as fixed, lets pass
+BODY_SIGMA = np.radians(0.02)  # of a turn that two tracked bodies tell
 MAX_PASSES = 5  # of hand-eye, for a better time and without views that do not fit
 DISAGREEMENT = 4.0  # standard errors between two estimates of the clock, from which they are called different
 
-Progress = Callable[[Iterable[int], str], Iterable[int]]
 Report = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is calibrated from where."""
-
-    bag: Path
-    board: Board | None = None
-    image_topic: str = "/knee_gap/image_raw/compressed"
-    pose_topic: str = "/knee_gap/scope_body/pose"
-    model: LensModel = field(default_factory=lambda: LensModel("equidistant"))
-    mount: Mount = Mount.CAMERA_HEAD
-    views: int = 48
-    free_intrinsics: bool = True
-    time_offset: float | None = None
-    max_offset: float = 0.25
-    begin: float = 0.0
-    end: float = float("inf")
-
-    def __post_init__(self) -> None:
-        if not 4 <= self.views <= 500:
-            raise PerceptionError(f"--views must lie in [4, 500], not {self.views}")
-        if not 0.0 < self.max_offset <= 2.0:
-            raise PerceptionError(f"--max-offset must lie in (0, 2] s, not {self.max_offset}")
 
 
 class Procedure:
     """Calibration steps over one bag; what one step read serves the next."""
 
-    def __init__(self, request: Request, report: Report, progress: Progress) -> None:
-        self._request, self._report, self._progress = request, report, progress
-        self._bag = CalibrationBag(request.bag, request.begin, request.end)
-        self._track: PoseTrack | None = None
-        self._seen: dict[str, Observations] = {}
-
-    @property
-    def steps(self) -> dict[str, tuple[float, float]]:
-        """Parts that the bag marks, by name."""
-        return self._bag.steps()
+    def __init__(self, recording: Recording, report: Report) -> None:
+        self._recording, self._request, self._report = recording, recording.request, report
 
     def intrinsics(self, calibration: Calibration | None) -> Calibration:
         """Camera intrinsics and distortion."""
-        seen = self._observe("board", calibration)
+        seen = self._recording.observe("board", calibration)
         fit = self._fit(seen)
         camera = fit.intrinsics
         sigma = np.sqrt(np.diag(camera.covariance))
@@ -98,17 +56,11 @@ class Procedure:
 
     def time_offset(self, calibration: Calibration | None) -> Calibration:
         """Time between video and tracker."""
-        track = self._poses()
-        part = self._bag.part("board")
-        self._report("following the picture's motion")
+        track = self._recording.track()
         size: list[tuple[int, int]] = []
 
         def images() -> Iterable[tuple[int, npt.NDArray[np.uint8]]]:
-            total = len(part.image_stamps(self._request.image_topic))
-            pictures = part.images(self._request.image_topic)
-            for _, (stamp, image) in zip(
-                self._progress(range(total), "image motion"), pictures, strict=False
-            ):
+            for stamp, image in self._recording.images("board"):
                 size[:] = [(image.shape[1], image.shape[0])]
                 yield stamp, image
 
@@ -123,7 +75,7 @@ class Procedure:
 
     def hand_eye(self, calibration: Calibration | None) -> Calibration:
         """Lens on the tracked body, the scope not turned in its camera head."""
-        seen = self._observe("board", calibration)
+        seen = self._recording.observe("board", calibration)
         angles = np.array([view.notch_angle for view in seen.views])
         reference = common_angle(angles, FIXED_TURN)
         away = np.abs(wrapped(angles - reference))
@@ -134,7 +86,8 @@ class Procedure:
                 "views: hold it "
                 "fixed, or use calibrate oblique"
             )
-        found, known = self._lens(calibration, [seen], [np.zeros(len(seen.views))])
+        known = self._with_camera(calibration)
+        found = self._lens(known, [seen], [np.zeros(len(seen.views))], self._recording.offset(known))
         oblique = None
         if np.isfinite(reference):
             self._report(
@@ -145,23 +98,29 @@ class Procedure:
 
     def oblique(self, calibration: Calibration | None) -> Calibration:
         """Lens on the tracked body and the axis about which an oblique scope turns in its camera head."""
-        marked = [name for name in ("board", "oblique") if name in self.steps]
-        parts = [self._observe(name, calibration) for name in marked or ["oblique"]]
-        angles = [np.array([view.notch_angle for view in seen.views]) for seen in parts]
-        reference = common_angle(np.concatenate(angles), FIXED_TURN)
-        if not np.isfinite(reference):
-            raise PerceptionError(
-                "the notch is seen in none of the views: is the whole round picture in the image, and lit?"
-            )
-        turns = [_held(wrapped(angle - reference)) for angle in angles]
+        marked = [name for name in ("board", "oblique") if name in self._recording.steps]
+        parts = [self._recording.observe(name, calibration) for name in marked or ["oblique"]]
+        angles = np.concatenate([[view.notch_angle for view in seen.views] for seen in parts])
+        notch = common_angle(angles, FIXED_TURN)
+        known = self._with_camera(calibration)
+        offset, T_head_scope = self._recording.offset(known), None
+        if self._request.scope_pose_topic is None:
+            turns = turns_by_notch(parts)
+        else:
+            # What a body's turn is at an image depends on the clock, which the same fit makes better.
+            for _ in range(MAX_PASSES):
+                turns, T_head_scope = turns_by_body(self._recording, parts, known.require_camera(), offset)
+                better = self._hand_eye(known, parts, turns, offset)[0].time_offset
+                if abs(better - offset) < 5e-4:
+                    break
+                offset = better
         together = np.concatenate(turns)
-        seen_count = int(np.isfinite(together).sum())
         self._report(
-            f"notch seen in {seen_count} of {len(together)} views, turned by "
-            f"{np.degrees(np.nanmin(together)):+.1f} to "
-            f"{np.degrees(np.nanmax(together)):+.1f} deg from {np.degrees(reference):.2f} deg"
+            f"turn known in {np.isfinite(together).sum()} of {len(together)} views, "
+            f"{np.degrees(np.nanmin(together)):+.1f} to {np.degrees(np.nanmax(together)):+.1f} deg; notch at "
+            f"{np.degrees(notch):.2f} deg"
         )
-        found, known = self._lens(calibration, parts, turns)
+        found = self._lens(known, parts, turns, offset)
         tilt, shift = found.axis_sigma or (float("nan"), float("nan"))
         if found.axis is not None:
             self._report(
@@ -169,7 +128,7 @@ class Procedure:
                 f"{np.degrees(np.arccos(found.axis.direction @ found.T_body_lens[:3, 2])):.2f} deg oblique "
                 "to it"
             )
-        oblique = Oblique(reference, found.axis, tilt, shift)
+        oblique = Oblique(notch, found.axis, tilt, shift, T_head_scope)
         return _kept(known, parts[0], **self._parts(known, found), oblique=oblique)
 
     def pivot(self, calibration: Calibration | None) -> Calibration:
@@ -178,8 +137,7 @@ class Procedure:
             raise PerceptionError(
                 "the tip is added to a calibration of the camera: run calibrate intrinsics first"
             )
-        part = self._bag.part("pivot")
-        found = calibrate_pivot(part.poses(self._request.pose_topic)[1])
+        found = calibrate_pivot(self._recording.raw_poses("pivot"))
         sigma = np.sqrt(np.diag(found.covariance))
         self._report(
             f"tip at {_mm(found.tip)} ± {_mm(sigma, 3)} mm on the body, {1e3 * found.rms:.3f} mm RMS over "
@@ -189,40 +147,6 @@ class Procedure:
             apart = np.linalg.norm(found.tip - calibration.lens.T_body_lens[:3, 3])
             self._report(f"the lens is {1e3 * apart:.2f} mm from the tip")
         return replace(calibration, tip=Tip(found.tip, found.covariance, found.rms))
-
-    def _poses(self) -> PoseTrack:
-        if self._track is None:
-            whole = CalibrationBag(self._request.bag, self._request.begin, self._request.end)
-            self._track = PoseTrack.of(*whole.poses(self._request.pose_topic))
-        return self._track
-
-    def _observe(self, part: str, calibration: Calibration | None) -> Observations:
-        request = self._request
-        if request.board is None:
-            raise PerceptionError("which board is in the picture? Say --board")
-        if part not in self._seen:
-            bag = self._bag.part(part)
-            try:
-                track: PoseTrack | None = self._poses()
-            except PerceptionError:
-                track = None
-            stamps = bag.image_stamps(request.image_topic)
-            chosen = still_stamps(stamps, request.views, track, self._offset(calibration))
-            if len(chosen) == 0:
-                raise PerceptionError(
-                    f"none of the {len(stamps)} images was taken while the body was tracked"
-                )
-            self._seen[part] = observe(bag, request.image_topic, request.board, chosen, self._progress)
-        seen = self._seen[part]
-        if calibration is not None:
-            calibration.require_image_size(seen.width_px, seen.height_px)
-        return seen
-
-    def _offset(self, calibration: Calibration | None) -> float:
-        """Time offset to start from: asked for, calibrated before, or none."""
-        if self._request.time_offset is not None:
-            return self._request.time_offset
-        return calibration.clock.offset if calibration and calibration.clock else 0.0
 
     def _fit(self, seen: Observations) -> IntrinsicsFit:
         views = [view.board for view in seen.views]
@@ -234,38 +158,48 @@ class Procedure:
             )
         return fit_intrinsics(views, seen.width_px, seen.height_px, self._request.model)
 
-    def _lens(
-        self, calibration: Calibration | None, parts: list[Observations], turns: list[Array]
-    ) -> tuple[HandEye, Calibration]:
-        """Hand-eye over parts, each view at its turn; and the calibration with a camera in it."""
-        request = self._request
-        if isinstance(request.board, DotGrid) and not request.board.has_orientation:
+    def _with_camera(self, calibration: Calibration | None) -> Calibration:
+        """The calibration, with a camera from this bag where it has none."""
+        if isinstance(self._request.board, DotGrid) and not self._request.board.has_orientation:
             raise PerceptionError(
                 "a symmetric dot grid looks the same when turned by half a turn: use asymmetric dots or "
                 "ChArUco"
             )
-        known = calibration
-        if known is None or known.camera is None:
-            known = self.intrinsics(calibration)
-        camera = known.require_camera()
+        if calibration is None or calibration.camera is None:
+            return self.intrinsics(calibration)
+        return calibration
+
+    def _lens(
+        self, known: Calibration, parts: list[Observations], turns: list[Array], offset: float
+    ) -> HandEye:
+        """Hand-eye over parts, each view at its turn, told in words."""
+        found, count, offered = self._hand_eye(known, parts, turns, offset)
+        if count < offered:
+            self._report(f"{offered - count} of {offered} views left out: the others do not explain them")
+        self._tell(found, count)
+        return found
+
+    def _hand_eye(
+        self, known: Calibration, parts: list[Observations], turns: list[Array], offset: float
+    ) -> tuple[HandEye, int, int]:
+        """Hand-eye at the best time offset, without views that do not fit; how many it used, and had."""
+        request, camera = self._request, known.require_camera()
         model = LensModel(camera.distortion_model, request.model.high_order)
-        board_views = [view.board for seen in parts for view in seen.views]
         # Outliers among the points are told by the lens alone, before the tracker can be blamed for them.
+        board_views = [view.board for seen in parts for view in seen.views]
         fit = fit_intrinsics(board_views, parts[0].width_px, parts[0].height_px, model)
-        turn_of = {
-            view.board.stamp_ns: turn
-            for seen, angles in zip(parts, turns, strict=True)
-            for view, turn in zip(seen.views, angles, strict=True)
-        }
+        stamps = [view.stamp_ns for view in board_views]
+        turn_of = dict(zip(stamps, np.concatenate(turns), strict=True))
         kept_turns = np.array([turn_of[view.stamp_ns] for view in fit.views])
-        sigmas = np.where(kept_turns == 0.0, 0.0, NOTCH_SIGMA)
+        sigma = BODY_SIGMA if request.scope_pose_topic else NOTCH_SIGMA
+        sigmas = np.where(kept_turns == 0.0, 0.0, sigma)
         if request.free_intrinsics:
             camera = fit.intrinsics
         settings = HandEyeSettings(free_intrinsics=request.free_intrinsics, mount=request.mount)
-        offset, keep = self._offset(known), np.ones(len(fit.views), dtype=bool)
+        keep = np.ones(len(fit.views), dtype=bool)
         for _ in range(MAX_PASSES):
             chosen = [view for view, good in zip(fit.views, keep, strict=True) if good]
-            views = tracked_views(chosen, kept_turns[keep], sigmas[keep], self._poses(), offset)
+            views = tracked_views(chosen, kept_turns[keep], sigmas[keep], self._recording.track(), offset)
             found = calibrate_hand_eye(views, camera, model, settings)
             offset += found.time_offset
             bad = {view.board.stamp_ns for view, out in zip(views, found.outlying, strict=True) if out}
@@ -273,11 +207,7 @@ class Procedure:
             # Poses are read again at the better time, until what is left is too short to matter.
             if abs(found.time_offset) < 5e-4 and not bad:
                 break
-        if left_out := int((~keep).sum()):
-            self._report(f"{left_out} of {len(keep)} views left out: the others do not explain them")
-        found = replace(found, time_offset=offset)
-        self._tell(found, len(views))
-        return found, known
+        return replace(found, time_offset=offset), len(views), len(fit.views)
 
     def _tell(self, found: HandEye, count: int) -> None:
         self._report("solvers, RMS px: " + ", ".join(f"{s.name} {s.rms_px:.1f}" for s in found.solvers))
@@ -337,9 +267,3 @@ def _kept(calibration: Calibration | None, seen: Observations, **parts: object) 
 
 def _mm(lengths: Array, digits: int = 2) -> str:
     return "(" + ", ".join(f"{1e3 * value:.{digits}f}" for value in lengths) + ")"
-
-
-def _held(turns: Array) -> Array:
-    """Turns of a part of the bag; exactly 0 where the notch says that the scope was held still."""
-    seen = turns[np.isfinite(turns)]
-    return np.zeros_like(turns) if len(seen) and np.abs(seen).max() < FIXED_TURN else turns
