@@ -11,6 +11,7 @@ from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, brightness
+from knee_gap_perception.gap_confidence import gap_confidence
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
 from knee_gap_perception.poses import LensPose
@@ -225,11 +226,12 @@ class GapEdgeDetector:
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
-        if section.contrast.min() < self.parameters.minimum_contrast:
+        confidence = gap_confidence(section, field.extent, small, dark)
+        if confidence < self.parameters.minimum_confidence:
             raise _NoPointsError(
                 EdgeStatus.NO_GAP,
-                f"the dark part is shaded tissue: contrast {section.contrast.min():.2f}, a gap has at least "
-                f"{self.parameters.minimum_contrast:.2f}",
+                f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
+                f"{self.parameters.minimum_confidence:.2f}",
             )
         return section
 

@@ -16,7 +16,7 @@ class EdgeParameters:
     """
 
     segmentation: str = field(
-        default="otsu3",
+        default="watershed",
         metadata={"description": "How the dark gap is told from tissue", "choices": STRATEGIES},
     )
     network_path: str = field(
@@ -59,11 +59,11 @@ class EdgeParameters:
             "range": (0.005, 0.2),
         },
     )
-    minimum_contrast: float = field(
-        default=0.45,
+    minimum_confidence: float = field(
+        default=0.5,
         metadata={
-            "description": "Least step of brightness over an edge of a gap, against the tissue's [-]",
-            "range": (0.05, 0.95),
+            "description": "Confidence that a dark part is a gap, below which it is taken for shade [-]",
+            "range": (0.0, 1.0),
         },
     )
     minimum_width: float = field(

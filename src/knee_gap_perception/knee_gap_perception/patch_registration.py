@@ -21,7 +21,9 @@ Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
 LOCAL_MEAN = 17  # [px] side of the window of the local mean and contrast
-FAINT = 0.01  # [-] contrast of detail added to the local one: noise must not look like texture
+SMOOTHING = 0.8  # [px] standard deviation: what is finer is noise
+FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
+NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
@@ -83,7 +85,8 @@ def surface_around(
         inner = np.s_[top - row : bottom - row, left - column : right - column]
         crop[inner] = grey[top:bottom, left:right]
         valid[inner] = 1 if field_mask is None else field_mask[top:bottom, left:right]
-    smooth = cv2.GaussianBlur(crop, (3, 3), 0).astype(np.float32)
+    raw = crop.astype(np.float32)
+    smooth = cv2.GaussianBlur(raw, (0, 0), SMOOTHING)
     surface = valid * ((smooth > dark_below) & (smooth < GLARE))
     # Outside the crop counts as no surface.
     eroded = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=[0.0])
@@ -99,7 +102,15 @@ def surface_around(
     power = cv2.boxFilter(detail * detail, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     strength = np.sqrt(np.maximum(power, 0.0) / np.maximum(count, 1.0))
     weight = (surface * (1.0 - 0.9 * highlight)).astype(np.float32)
-    return Surface(detail / (strength + FAINT), weight, (column, row))
+    faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
+    return Surface(detail / (strength + faint), weight, (column, row))
+
+
+def _noise(raw: Float32, surface: Float32) -> float:
+    """Standard deviation of the noise of the pixels of the surface (Immerkaer 1996)."""
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    rough = np.abs(cv2.filter2D(raw, -1, kernel)[surface > 0])
+    return float(np.sqrt(np.pi / 2) / 6 * rough.mean()) if rough.size else 0.0
 
 
 class Patch:

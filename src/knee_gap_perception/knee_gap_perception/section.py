@@ -22,8 +22,9 @@ CANDIDATES = 4  # dark parts looked at, largest first
 class Section:
     """The largest inscribed disc (centre [px], radius [px]) and the two edges across it (2, 2) [px].
 
-    `contrast` (2,) is the step of brightness over each edge against the tissue's brightness; `levels` (3,)
-    the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1. All in pixels of the full image.
+    `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,)
+    the step over each edge against the tissue's; `solidity` the area of the disc against that of its dark
+    part, up to 1 for a round one: shaded tissue is ragged. Lengths are in pixels of the full image.
     """
 
     centre: Array
@@ -31,6 +32,7 @@ class Section:
     edges: Array
     contrast: Array
     levels: Array
+    solidity: float
 
     @property
     def across(self) -> Array:
@@ -44,10 +46,10 @@ def find_section(
 ) -> Section | None:
     """The best section through the dark pixels; None where no dark part has tissue on both sides.
 
-    `dark` and `value` (brightness) are (h, w) at working size, `scale` times the full one; `region` is the
-    centre [px] and radius [px] of the region of interest in the full image, in which the disc's centre must
-    lie. Of several dark parts the one with the largest disc is taken, discs nearer the region's centre
-    preferred.
+    `dark` and `value` (brightness of any kind) are (h, w) at working size, `scale` times the full one;
+    `region` is the centre [px] and radius [px] of the region of interest in the full image, in which the
+    disc's centre must lie. Of several dark parts the one with the largest disc is taken, discs nearer the
+    region's centre preferred.
     """
     opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
@@ -116,6 +118,7 @@ def _section_through(
         edges=(ends + 0.5) / scale - 0.5,
         contrast=contrast,
         levels=levels,
+        solidity=float(np.pi * radius**2 / max(part.sum(), 1)),
     )
 
 

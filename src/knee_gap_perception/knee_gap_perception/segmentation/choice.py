@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.strategy import Segmentation
+from knee_gap_perception.segmentation.thresholds import Adaptive, Otsu, Otsu3
 
 STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese", "onnx")
 
@@ -14,22 +16,22 @@ def segmentation_named(name: str, **settings: Any) -> Segmentation:
 
     Raises PerceptionError for an unknown name and for what the strategy itself refuses.
     """
-    # Imported by need: the libraries behind some of them take a second to load.
-    if name in ("otsu", "otsu3", "adaptive"):
-        from knee_gap_perception.segmentation import thresholds
+    simple: dict[str, Callable[..., Segmentation]] = {
+        "otsu": Otsu,
+        "otsu3": Otsu3,
+        "adaptive": Adaptive,
+    }
+    if name in simple:
+        return simple[name](**settings)
+    # Imported by need: the library behind these takes a second to load.
+    if name == "watershed":
+        from knee_gap_perception.segmentation.flooding import Watershed
 
-        thresholding: dict[str, Callable[..., Segmentation]] = {
-            "otsu": thresholds.Otsu,
-            "otsu3": thresholds.Otsu3,
-            "adaptive": thresholds.Adaptive,
-        }
-        return thresholding[name](**settings)
-    if name in ("watershed", "chan_vese"):
-        from knee_gap_perception.segmentation import regions
+        return Watershed(**settings)
+    if name == "chan_vese":
+        from knee_gap_perception.segmentation.active_contour import ChanVese
 
-        return regions.Watershed(**settings) if name == "watershed" else regions.ChanVese(**settings)
+        return ChanVese(**settings)
     if name == "onnx":
-        from knee_gap_perception.segmentation.network import Network
-
         return Network(**settings)
     raise PerceptionError(f"segmentation must be one of {', '.join(STRATEGIES)}, not '{name}'")
