@@ -57,6 +57,7 @@ class KneeCamera:
             ambient=0.012,
             glint=4.0,
             sheen=0.03,
+            facing_exponent=0.6,
         )
         self._turbidity = Turbidity(conditions.veil, conditions.wisps, self._stop.shape, seed)
         self._debris = Debris(conditions.debris, seed)

@@ -20,7 +20,8 @@ class Light:
     to the side. ``reference`` [m] is the distance where it gives unit irradiance; ``absorption`` [1/m] of
     the fluid dims what is far away, on the way there and back; ``ambient`` is what the joint scatters.
     ``glare`` scales the mirror-like reflection of the wet surface, ``shininess`` is its exponent, ``glint``
-    how much the relief scatters it, ``sheen`` the share of its wide part.
+    how much the relief scatters it, ``sheen`` the share of its wide part. ``facing_exponent`` < 1 keeps
+    surfaces seen aslant brighter than Lambert's law does, as light that comes back out of cartilage does.
     """
 
     position: tuple[float, float, float] = (0.0004, -0.0014, -0.0002)
@@ -32,6 +33,7 @@ class Light:
     ambient: float = 0.004
     glint: float = 1.0
     sheen: float = 0.0
+    facing_exponent: float = 1.0
 
 
 def shade(
@@ -55,7 +57,7 @@ def shade(
     constants = np.array(
         [
             *(light.spread, light.reference, light.absorption, light.glare, light.shininess),
-            *(light.ambient, light.glint, light.sheen),
+            *(light.ambient, light.glint, light.sheen, light.facing_exponent),
         ]
     )
     result = np.empty((len(points), 3), np.float32)
@@ -83,7 +85,7 @@ def _shade(
     constants: FloatArray,
     result: FloatImage,
 ) -> None:
-    spread, reference, absorption, glare, shininess, ambient, glint, sheen = constants
+    spread, reference, absorption, glare, shininess, ambient, glint, sheen, exponent = constants
     size = textures.shape[1]
     texel = np.empty(textures.shape[3])
     for i in range(len(points)):
@@ -115,7 +117,7 @@ def _shade(
         beam = ahead**spread * (reference / to_light) ** 2 * np.exp(-absorption * (to_light + to_eye))
         beam *= reach[i, 0]
         # Light that scatters under the surface reaches a little beyond the terminator.
-        facing = max(0.0, (bx * lx + by * ly + bz * lz + 0.12) / 1.12)
+        facing = max(0.0, (bx * lx + by * ly + bz * lz + 0.12) / 1.12) ** exponent
         hx, hy, hz = lx + ex, ly + ey, lz + ez
         scale = 1.0 / np.sqrt(hx * hx + hy * hy + hz * hz)
         mx = nx - glint * (texel[3] * ux + texel[4] * vx)
