@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "coverage = knee_gap_uncertainty.coverage.command:main",
+            "joint_motion_table = knee_gap_uncertainty.joint_motion_table:main",
             "study = knee_gap_uncertainty.study.command:main",
             "uncertainty_node = knee_gap_uncertainty.uncertainty_node:main",
         ],

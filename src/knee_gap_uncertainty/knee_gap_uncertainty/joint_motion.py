@@ -23,10 +23,10 @@ Array = npt.NDArray[np.float64]
 
 # One bearing in 10^4 exceeds it by chance; the price of an alarm is one image without numbers.
 LARGEST_PRESENT = 18.4
-# So many contradicting images in a row end the track.
+# So many more contradicting images than agreeing ones end the track; fewer while it is young.
 FEWEST_CONTRADICTIONS = 5
-# One bearing in 10^6 exceeds it by chance: it is tested at every image and the price is the track.
-LARGEST_FIRST = 27.6
+# One bearing in 20,000 exceeds it by chance: it is tested at every image and the price is the track.
+LARGEST_FIRST = 19.8
 # 1 track in 100 of 600 images exceeds it by chance, by simulation: see `joint_motion_table`.
 LARGEST_SHIFT = 22.0
 # Views on either side of a jump: fewer may be a few bad edges, which the fit gates out.
@@ -63,10 +63,16 @@ class MotionStatistics(NamedTuple):
 
 
 class JointMotionTest:
-    """The sequential test of one track: counts the contradictions in a row."""
+    """The sequential test of one track.
+
+    An image that contradicts is a doubt that it takes an agreeing one to clear: where an edge was wrong from
+    the start, its path crosses the true one now and then.
+    """
 
     def __init__(self) -> None:
-        self._contradictions = 0
+        # Images found still.
+        self.still_count = 0
+        self._doubts = 0
 
     def judge(self, views: Views, fitted: MultiViewFit | None, passing: Views | None = None) -> Finding:
         """Finding at the last of `views`, all earlier ones having been found still.
@@ -85,12 +91,19 @@ class JointMotionTest:
     def decide(self, found: MotionStatistics) -> Finding:
         """Finding at the present view from its statistics."""
         if found.present > LARGEST_PRESENT:
-            self._contradictions += 1
-            ended = self._contradictions >= FEWEST_CONTRADICTIONS
-            return Finding.MOVED if ended else Finding.CONTRADICTION
-        self._contradictions = 0
+            self._doubts += 1
+            # A young track is no better founded than what contradicts it.
+            enough = min(FEWEST_CONTRADICTIONS, self.still_count)
+            return Finding.MOVED if self._doubts >= enough else Finding.CONTRADICTION
+        if self._doubts > 1:
+            self._doubts -= 1
+            return Finding.CONTRADICTION
+        self._doubts = 0
         moved = found.first > LARGEST_FIRST or found.shift > LARGEST_SHIFT
-        return Finding.MOVED if moved else Finding.STILL
+        if moved:
+            return Finding.MOVED
+        self.still_count += 1
+        return Finding.STILL
 
 
 class Observations(NamedTuple):

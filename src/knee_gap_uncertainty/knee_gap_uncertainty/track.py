@@ -70,7 +70,6 @@ class Track:
         self.ended = False
         # The last image that was found still, where the window does not keep it.
         self._passing: Views | None = None
-        self._still_count = 0
         self.situation: Situation | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
@@ -100,7 +99,6 @@ class Track:
         finding = self._joint_motion.judge(views, fitted, self._passing)
         if finding is not Finding.STILL:
             return self._contradicted(blank, view, finding)
-        self._still_count += 1
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
             return self._told(blank, view, flaw)
@@ -197,7 +195,7 @@ class Track:
             view_count=fitted.view_count,
             shares=fitted.shares,
         )
-        if self._still_count < FEWEST_VIEWS_TO_CHECK:
+        if self._joint_motion.still_count < FEWEST_VIEWS_TO_CHECK:
             return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
         if not np.isfinite(bounds.gap_max):
             return replace(estimate, reason=UNBOUNDED)
