@@ -28,6 +28,8 @@ fi
 # 1280x720 images at 60 Hz need a shared-memory segment that holds them, and an allocator that keeps its pages.
 export FASTRTPS_DEFAULT_PROFILES_FILE="${FASTRTPS_DEFAULT_PROFILES_FILE:-$_knee_gap_checkout/src/knee_gap_bringup/config/fastdds.xml}"
 export MALLOC_MMAP_THRESHOLD_=268435456 MALLOC_TRIM_THRESHOLD_=1073741824 MALLOC_TOP_PAD_=67108864
+# The matrices here are small: threads of the linear algebra would spin for a second core and win nothing.
+export OPENBLAS_NUM_THREADS="${OPENBLAS_NUM_THREADS:-1}"
 # This machine only, unless the user says otherwise (SUBNET for a controller on another machine).
 export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 unset _knee_gap_checkout _knee_gap_root _knee_gap_libraries _knee_gap_site

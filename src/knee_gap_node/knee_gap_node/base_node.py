@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from threadpoolctl import threadpool_limits
 
 from knee_gap_node.errors import ConfigurationError
 from knee_gap_node.parameters import as_rows, declare, refuse_unknown
@@ -79,6 +80,8 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     except Exception as error:  # rclpy's parser raises several unrelated kinds for a bad --ros-args
         print(f"cannot start: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    # The matrices here are small: threads of the linear algebra would spin for a second core and win nothing.
+    threadpool_limits(1)
     node = None
     try:
         node = make_node()
