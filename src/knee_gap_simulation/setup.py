@@ -5,7 +5,7 @@ NAME = "knee_gap_simulation"
 setup(
     name=NAME,
     version="0.1.0",
-    description="A knee whose gap is known, the scope that looks at it and the tracker that follows the scope.",
+    description="A knee whose gap is known, the scope that looks at it, the tracker that follows it.",
     license="Apache-2.0",
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",

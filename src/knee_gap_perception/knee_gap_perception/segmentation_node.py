@@ -15,6 +15,7 @@ from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.segmentation_parameters import TransportParameters
+from knee_gap_perception.warm_up import warm_up
 
 
 class SegmentationNode(BaseNode):
@@ -25,6 +26,8 @@ class SegmentationNode(BaseNode):
         transport = self.declare(TransportParameters).image_transport
         self._stream = EdgeStream(self.declare(EdgeParameters))
         self.refuse_unknown_parameters()
+        # Compiled before the first image, so that its answer is not late.
+        warm_up()
         self._dropped = 0
         self._sequence: int | None = None
         self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)

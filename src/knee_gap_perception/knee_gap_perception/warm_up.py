@@ -1,0 +1,36 @@
+"""Everything that finding and following the edges loads or compiles, before the first real image."""
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_perception.camera import FisheyeCamera
+from knee_gap_perception.edge_detector import GapEdgeDetector
+from knee_gap_perception.edges import EdgeStatus
+
+HEIGHT, WIDTH = 720, 1280
+RADIUS = 350
+FOCAL = 458.0
+
+
+def picture(shift: int) -> npt.NDArray[np.uint8]:
+    """Speckled tissue around a dark gap in a round field of view, moved sideways by `shift` [px]."""
+    rng = np.random.default_rng(1)
+    speckle = cv2.GaussianBlur(rng.normal(0.0, 1.0, (HEIGHT, WIDTH)), (0, 0), 4.0)
+    tissue = 150.0 + 25.0 * speckle / speckle.std()
+    tissue[300:400] = 8.0
+    tissue = np.roll(cv2.GaussianBlur(tissue, (0, 0), 1.5), shift, axis=1)
+    rows, columns = np.ogrid[:HEIGHT, :WIDTH]
+    outside = np.hypot(rows - HEIGHT / 2, columns - WIDTH / 2) > RADIUS
+    tissue[outside] = 0.0
+    return np.repeat(np.clip(tissue, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def warm_up() -> EdgeStatus:
+    """Find a gap and follow its edges through a few pictures; status of the last, VALID if all was run."""
+    camera = FisheyeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (0.0, 0.0, 0.0, 0.0))
+    detector = GapEdgeDetector()
+    status = EdgeStatus.UNKNOWN
+    for k in range(4):
+        status = detector.process(1 + 16_666_667 * k, picture(2 * k), camera).status
+    return status

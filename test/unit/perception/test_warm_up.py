@@ -1,0 +1,13 @@
+"""After warming up nothing is compiled any more."""
+
+from knee_gap_perception import patch_kernel
+from knee_gap_perception.edges import EdgeStatus
+from knee_gap_perception.warm_up import warm_up
+
+
+def test_warm_up_follows_a_gap_and_so_compiles_the_kernel() -> None:
+    assert warm_up() is EdgeStatus.VALID
+    compiled = list(patch_kernel.normal_equations.signatures)  # type: ignore[attr-defined]
+    assert compiled
+    warm_up()
+    assert list(patch_kernel.normal_equations.signatures) == compiled  # type: ignore[attr-defined]
