@@ -20,14 +20,16 @@ Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
-LOCAL_MEAN = 17  # [px] side of the window of the local mean and contrast
-SMOOTHING = 0.8  # [px] standard deviation: what is finer is noise
+LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
+SMOOTHING = 1.3  # [px] standard deviation: what is finer is noise
 FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
 NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
+CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
+DOUBT = 8.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
 NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
@@ -155,7 +157,7 @@ class Patch:
         warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
         for _ in range(MAXIMUM_ITERATIONS):
             hessian, slope, told = self._look(surface, warp, gain)
-            precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2)
+            precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2 * _doubt(told[2]))
             posterior = hessian * precision + prior_information
             step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
             deviation += step
@@ -180,6 +182,15 @@ class Patch:
         """Matrix (2, 3) from a pixel of the patch (column, row) to one of the crop."""
         corner = warp.position - np.array(surface.origin) - self.half_size * warp.shape.sum(axis=1)
         return np.concatenate([warp.shape, corner[:, None]], axis=1)
+
+
+def _doubt(correlation: float) -> float:
+    """Factor on the variance of a registration whose textures correlate no better than this.
+
+    The noise of both textures makes gradients that say nothing, and may lock onto each other. Found on the
+    simulated knee: the error of a registration grows exponentially as the correlation falls.
+    """
+    return float(np.exp(2.0 * DOUBT * max(CERTAIN - max(correlation, 0.0), 0.0)))
 
 
 def _compose(warp: Warp, step: Array) -> Warp:

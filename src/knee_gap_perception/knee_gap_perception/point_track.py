@@ -31,7 +31,8 @@ MILD = (
 FRESH = 0.80  # correlation above which a patch needs no successor
 GOOD = 0.70  # correlation from which a new patch may be taken
 CLEAR = 0.85  # share of the patch that must be seen, free of highlights, to take a new one
-FAIR = 0.60  # correlation below which the point is not seen
+FAIR = 0.40  # correlation below which the point is not seen, where the pose tells where it must be
+FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
 HANDOVER_ERROR = 0.50  # [px] error that a patch adds when it is taken from a later image
@@ -109,12 +110,13 @@ class PointTrack:
             anchor = self._anchors[index]
             start = self._coarse(anchor.patch, surface, prediction)
             found = anchor.patch.find(surface, start, prediction.covariance)
-            anchor.rest = 0 if _believable(found, prediction) else REST
-            if _believable(found, prediction):
+            believed = _believable(found, prediction, FAIR if self._posed(view) else FAIR_ALONE)
+            anchor.rest = 0 if believed else REST
+            if believed:
                 best = (index, found)
                 break
         if best is None:
-            return self._coast(predictions[len(self._anchors) - 1], view)
+            return self._coast(predictions[len(self._anchors) - 1])
         return self._accept(best[0], best[1], predictions[best[0]], surface, view)
 
     def _candidates(self) -> list[int]:
@@ -127,6 +129,9 @@ class PointTrack:
         newest = len(self._anchors) - 1
         return list(dict.fromkeys([*mild[:1], newest]))
 
+    def _posed(self, view: View | None) -> bool:
+        return self._plane is not None and view is not None
+
     def _predict(self, index: int, camera: Camera, view: View | None) -> Prediction:
         anchor = self._anchors[index]
         if self._plane is not None and view is not None and anchor.view is not None:
@@ -135,8 +140,11 @@ class PointTrack:
                 return prediction
         growth = 1.0 + self._unseen
         warp = Warp(self._warp.position + self._velocity, self._warp.shape @ np.linalg.inv(anchor.shape))
-        variances = [(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4
-        return Prediction(warp, np.diag(variances), np.zeros((6, 3)))
+        covariance = np.diag([(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4)
+        # What the last image did not tell about the point, this one has to.
+        excess = float(np.linalg.eigvalsh(self._covariance - anchor.covariance)[-1])
+        covariance[:2, :2] += max(excess, 0.0) * np.eye(2)
+        return Prediction(warp, covariance, np.zeros((6, 3)))
 
     def _coarse(self, patch: Patch, surface: Surface, prediction: Prediction) -> Warp:
         """Best whole-pixel position around the prediction, the patch drawn as it should look there."""
@@ -156,18 +164,16 @@ class PointTrack:
         )
         rows, columns = np.mgrid[0 : score.shape[0], 0 : score.shape[1]]
         away = np.hypot(rows - reach, columns - reach) / reach
-        row, column = np.unravel_index(int((score - 0.15 * away**2).argmax()), score.shape)
+        row, column = np.unravel_index(int((score - 0.3 * away**2).argmax()), score.shape)
         return Warp(warp.position + np.array([column - reach, row - reach], float), warp.shape)
 
-    def _coast(self, prediction: Prediction, view: View | None) -> Sighting:
+    def _coast(self, prediction: Prediction) -> Sighting:
         """The prediction alone, while the point is not seen."""
         self._unseen += 1
         self._velocity = 0.8 * self._velocity
         newest = self._anchors[-1]
         self._warp = Warp(prediction.warp.position, prediction.warp.shape @ newest.shape)
-        known = self._plane is not None and view is not None
-        error = newest.covariance if known else self._covariance
-        self._covariance = error + prediction.covariance[:2, :2]
+        self._covariance = newest.covariance + prediction.covariance[:2, :2]
         return Sighting(prediction.warp.position, self._covariance, False, 0.0)
 
     def _accept(
@@ -209,11 +215,11 @@ def _strain(shape: Array) -> float:
     return float(max(np.abs(np.log(stretches)).max(), turn))
 
 
-def _believable(found: Registration, prediction: Prediction) -> bool:
+def _believable(found: Registration, prediction: Prediction, fair: float) -> bool:
     away = found.warp.position - prediction.warp.position
     distance = float(away @ np.linalg.solve(prediction.covariance[:2, :2], away))
     return (
-        found.correlation > FAIR
+        found.correlation > fair
         and found.seen > MINIMUM_SEEN
         and distance < 25.0
         and _strain(found.warp.shape) < 1.2
