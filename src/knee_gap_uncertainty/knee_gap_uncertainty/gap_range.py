@@ -11,7 +11,7 @@ from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.error_cloud import refuse_parallel, trace_cloud
 from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
 from knee_gap_uncertainty.extremes import extremes
-from knee_gap_uncertainty.overlap import hulls_meet
+from knee_gap_uncertainty.overlap import hull_distance
 from knee_gap_uncertainty.slices import slice_spokes
 from knee_gap_uncertainty.translation_volume import displacements
 from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE, triangulate
@@ -21,14 +21,18 @@ from knee_gap_uncertainty.vectors import row, subtract, vector
 LARGEST_ANGULAR_ERROR = math.pi / 2
 # The clouds grow with the square of the radii: 30 hold four million points each.
 MOST_RADII = 30
+# Where the hulls of worst-case clouds come nearer than this share of the least distance of their samples, the
+# samples lie too far apart to bound the gap from below, and the distance of the hulls does.
+FAR_NEARER = 0.5
 
 
 class GapRange(NamedTuple):
     """A gap [m] with its bounds [m] and its signal-to-noise ratio gap / (gap_max - gap_min), (26).
 
     `gap_max` is infinite, and `snr` zero, where the admitted errors let a point lie at infinity; `gap_min` is
-    zero where the clouds of the two points overlap. Without any error the bounds are the gap and `snr` is
-    infinite.
+    zero where the clouds of the two points overlap, and in the worst case the distance of their hulls where
+    that is less than half the least distance of their samples. Without any error the bounds are the gap and
+    `snr` is infinite.
     """
 
     gap: float
@@ -55,8 +59,9 @@ def gap_range(
     and G1, all in one frame. `angular_error` psi = theta + omega [rad] and `translation_error` Delta T [m]
     bound the errors of each bearing and of each position. `interval`: "worst_case" admits every sign in (17)
     and (18), "paper" none, as Table 4. `apex`: clouds of the rays of the "first" lens, the "second", or the
-    "best" of both, which has the higher ratio. `radii`: displacements of the lens in so many equal steps up
-    to the translation error; 1 is the outer shell.
+    "best" of both, which has the higher ratio; in the worst case the other still bounds the gap from below
+    where it comes far lower. `radii`: displacements of the lens in so many equal steps up to the translation
+    error; 1 is the outer shell.
 
     Raises BadInputError, TravelTooShortError, ParallelToTravelError, RaysMeetBehindError or UnboundedError,
     all of them MeasurementError, where no honest range exists.
@@ -79,7 +84,11 @@ def gap_range(
         ranges.append(range_from_apex(points.gap_first, views, psi, shifts, signs))
     if apex != "first":
         ranges.append(range_from_apex(points.gap_second, reversed_views(views), psi, shifts, signs))
-    return max(ranges, key=lambda found: (found.snr, found.gap_min))
+    best = max(ranges, key=lambda found: (found.snr, found.gap_min))
+    lowest = min(found.gap_min for found in ranges)
+    if interval == "worst_case" and lowest < FAR_NEARER * best.gap_min:
+        return ranged(best.gap, lowest, best.gap_max)
+    return best
 
 
 def range_from_apex(
@@ -96,6 +105,11 @@ def range_from_apex(
         views.travel, views.bearings_0, views.bearings_1, angular_error, shifts, signs
     )
     refuse_parallel(smallest_angle)
+    return ranged(gap, gap_min, gap_max)
+
+
+def ranged(gap: float, gap_min: float, gap_max: float) -> GapRange:
+    """The range with its signal-to-noise ratio (26)."""
     width = gap_max - gap_min
     return GapRange(gap, gap_min, gap_max, gap / width if width > 0 else math.inf)
 
@@ -122,8 +136,12 @@ def cloud_range(
     sliced_0 = slice_spokes(cloud_0.points, cloud_0.starts)
     sliced_1 = slice_spokes(cloud_1.points, cloud_1.starts)
     nearest, farthest = extremes(sliced_0, sliced_1)
-    if hulls_meet(sliced_0, cloud_0.far, sliced_1, cloud_1.far, subtract(row(own, 0), row(own, 1))):
-        nearest = 0.0
+    near = FAR_NEARER * nearest if signs.shape[0] > 1 else 0.0
+    between = hull_distance(
+        sliced_0, cloud_0.far, sliced_1, cloud_1.far, subtract(row(own, 0), row(own, 1)), near
+    )
+    if between <= near:
+        nearest = between
     if cloud_0.far.size + cloud_1.far.size > 0:
         farthest = math.inf
     return nearest, farthest, smallest_angle

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
+from scipy.optimize import linprog, minimize
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.overlap import hulls_meet
+from knee_gap_uncertainty.overlap import hull_distance, hulls_meet
 from knee_gap_uncertainty.slices import slice_spokes
 
 NONE = np.empty((3, 1, 0))
@@ -71,3 +71,36 @@ def test_far_points_carry_a_hull_on():
     assert not meet(CUBE, away)
     assert meet(CUBE, away, one_far=np.array([[[100.0]], [[0.5]], [[0.5]]]))
     assert not meet(CUBE, away, one_far=np.array([[[0.5]], [[100.0]], [[0.5]]]))
+
+
+def distance(one, other, enough=np.inf):
+    sliced = [
+        slice_spokes(np.ascontiguousarray(cloud.T)[:, None, :], np.array([0, len(cloud)]))
+        for cloud in (one, other)
+    ]
+    return hull_distance(sliced[0], NONE, sliced[1], NONE, (1.0, 0.2, -0.1), enough)
+
+
+def test_distance_of_hulls_is_that_of_a_quadratic_programme():
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        one, other = rng.normal(size=(2, 12, 3)) * [1.0, 1.0, 0.2] + np.array([[[0.0] * 3], [[2, 3, 1.0]]])
+        apart = minimize(
+            lambda shares, one=one, other=other: np.sum((shares[:12] @ one - shares[12:] @ other) ** 2),
+            np.full(24, 1 / 12),
+            bounds=[(0, 1)] * 24,
+            constraints=[
+                {"type": "eq", "fun": lambda shares: shares[:12].sum() - 1},
+                {"type": "eq", "fun": lambda shares: shares[12:].sum() - 1},
+            ],
+        )
+        true = np.sqrt(max(apart.fun, 0.0))
+        assert 0.985 * true - 1e-3 <= distance(one, other) <= true + 1e-6
+        assert distance(one, other, enough=0.1 * true) <= true + 1e-6
+
+
+def test_hulls_bound_the_gap_where_the_samples_are_sparse():
+    """Two needles of samples side by side: no samples are as near as the needles."""
+    along = np.linspace(0.0, 10.0, 4)[:, None] * [0.0, 0.0, 1.0]
+    beside = along + np.array([1.0, 0.0, 10.0 / 6.0])
+    assert distance(along, beside) == pytest.approx(1.0, rel=0.01)
