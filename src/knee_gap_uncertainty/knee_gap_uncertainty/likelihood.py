@@ -34,8 +34,8 @@ FLAT_PRIOR = 1e-12
 LARGEST_PASS_COUNT = 12
 LARGEST_RISE = 1.5
 LARGEST_CORRECTION = 0.9
-# Squared length of the last step, in standard deviations of the estimate.
-CONVERGED = 1e-6
+# Squared length of the last step, in standard deviations of the estimate; what is left after it is far less.
+CONVERGED = 1e-4
 
 
 class Measured(NamedTuple):
