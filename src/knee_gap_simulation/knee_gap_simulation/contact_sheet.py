@@ -25,6 +25,8 @@ def contact_sheet(seeds: Sequence[int], real: Sequence[ByteImage] = ()) -> ByteI
     rows = [_label([f"level {level}" for level in LEVELS])]
     for seed in tqdm(seeds, desc="rendering", unit="seed", disable=not sys.stderr.isatty()):
         rows.append(np.hstack([_tile(_moment(level, seed)) for level in LEVELS]))
+        if not sys.stderr.isatty():
+            print(f"rendered: seed {seed}", file=sys.stderr)
     if real:
         rows.append(_label(["real endoscopes"]))
     for first in range(0, len(real), len(LEVELS)):
@@ -41,8 +43,8 @@ def read_frames(path: Path, count: int = 4) -> list[ByteImage]:
     """
     pictures = sorted(p for p in path.iterdir() if p.suffix in (".jpg", ".png")) if path.is_dir() else [path]
     frames = [image for picture in pictures if (image := cv2.imread(str(picture))) is not None]
-    # A mask or an empty frame has hardly any shades.
-    frames = [image for image in frames if len(np.unique(image[::8, ::8])) > 32]
+    # A mask or an empty frame is black and white but for the traces of its compression.
+    frames = [image for image in frames if ((image > 25) & (image < 230)).mean() > 0.1]
     if not frames and path.is_file():
         video = cv2.VideoCapture(str(path))
         while (read := video.read())[0]:
