@@ -156,7 +156,7 @@ class GapEdgeDetector:
 
     def _check_frozen(self, picture: Image) -> None:
         # Noise makes every image of a live camera differ, even of a scene that does not move.
-        thumbnail = picture[3::8, 3::8].copy()
+        thumbnail = picture[7::24, 3::8].copy()
         same = self._thumbnail is not None and np.array_equal(thumbnail, self._thumbnail)
         self._thumbnail = thumbnail
         self._identical = self._identical + 1 if same else 0

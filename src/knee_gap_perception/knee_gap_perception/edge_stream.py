@@ -8,7 +8,14 @@ from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages import Image, image_from_compressed, image_from_message, stamp_ns
+from knee_gap_perception.lens_pose_prediction import LensPosePredictor
+from knee_gap_perception.messages import (
+    Image,
+    image_from_compressed,
+    image_from_message,
+    lens_pose_from_message,
+    stamp_ns,
+)
 from knee_gap_perception.overlay import draw_overlay
 
 NO_CAMERA = "no camera_info received yet"
@@ -25,6 +32,7 @@ class EdgeStream:
         self._image: Image | None = None
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
+        self._poses = LensPosePredictor()
         self._camera_key: tuple[object, ...] = ()
 
     def on_camera_info(self, message: Any) -> None:
@@ -40,6 +48,13 @@ class EdgeStream:
         except PerceptionError as error:
             self._camera, self._camera_flaw = None, str(error)
 
+    def on_lens_pose(self, message: Any) -> None:
+        """Take a pose of the lens, a geometry_msgs/PoseWithCovarianceStamped; a bad one is left out."""
+        try:
+            self._poses.add(lens_pose_from_message(message))
+        except PerceptionError as error:
+            self.counts[f"lens pose refused: {error}"] += 1
+
     def on_image(self, message: Any) -> GapEdges:
         """Edges in a sensor_msgs/Image or sensor_msgs/CompressedImage."""
         stamp, frame_id = stamp_ns(message.header), str(message.header.frame_id)
@@ -49,7 +64,8 @@ class EdgeStream:
             self._image = image
             if self._camera is None:
                 raise PerceptionError(self._camera_flaw)
-            edges = self.detector.process(stamp, image, self._camera, frame_id=frame_id)
+            lens_pose = self._poses.at(stamp)
+            edges = self.detector.process(stamp, image, self._camera, lens_pose, frame_id=frame_id)
             self.reason = self.detector.reason
         except PerceptionError as error:
             self.detector.end_track()

@@ -231,7 +231,8 @@ class FieldOfViewFinder:
     REFRESH_EVERY = (
         120  # images after which a disc is found anew: the camera turns and shifts on the eyepiece
     )
-    MISFITS = 10  # images in a row with picture outside the disc, after which it is found anew
+    CHECK_EVERY = 4  # images, of which one is looked at for picture outside the disc
+    MISFITS = 3  # of these in a row, after which the disc is found anew
 
     def __init__(self) -> None:
         self._field: FieldOfView | None = None
@@ -245,7 +246,8 @@ class FieldOfViewFinder:
             self._field, self._shape, self._age, self._misfits = None, image.shape, -1, 0
         self._age += 1
         if self._field is not None and np.isfinite(self._field.radius):
-            self._misfits = self._misfits + 1 if self._picture_outside(image) else 0
+            if self._age % self.CHECK_EVERY == 0:
+                self._misfits = self._misfits + 1 if self._picture_outside(image) else 0
             if self._misfits < self.MISFITS and self._age % self.REFRESH_EVERY:
                 return self._field
         elif self._field is not None and self._age % self.RETRY_EVERY:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from knee_gap_perception.edges import GapEdges
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.poses import LensPose
 
 Image = npt.NDArray[np.uint8]
 
@@ -101,6 +102,28 @@ def image_from_compressed(message: Any) -> Image:
     elif image.shape[2] == 4:
         image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
     return np.asarray(image, dtype=np.uint8)
+
+
+def lens_pose_from_message(message: Any) -> LensPose:
+    """Lens pose of a geometry_msgs/PoseWithCovarianceStamped.
+
+    Raises PerceptionError for numbers that are not finite and for a quaternion of no length.
+    """
+    place, turn = message.pose.pose.position, message.pose.pose.orientation
+    position = np.array([place.x, place.y, place.z], dtype=np.float64)
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    finite = all(np.isfinite(values).all() for values in (position, quaternion, covariance))
+    if not finite or np.linalg.norm(quaternion) < 0.5:
+        raise PerceptionError(f"a lens pose must be finite and turned by a unit quaternion, not {quaternion}")
+    return LensPose(
+        stamp_ns=stamp_ns(message.header),
+        frame_id=str(message.header.frame_id),
+        child_frame_id="",
+        position=position,
+        quaternion_xyzw=quaternion,
+        covariance=covariance,
+    )
 
 
 def fill_gap_edges(message: Any, edges: GapEdges) -> Any:

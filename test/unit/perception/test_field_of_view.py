@@ -98,7 +98,7 @@ def test_stream_keeps_the_disc_through_dark_images_and_finds_a_new_one_for_a_new
 def test_a_disc_that_grows_is_found_anew() -> None:
     finder = FieldOfViewFinder()
     finder.find(disc((1280, 720), (640, 360), 220))
-    for _ in range(finder.MISFITS + 1):
+    for _ in range(finder.CHECK_EVERY * (finder.MISFITS + 1)):
         field = finder.find(disc((1280, 720), (640, 360), 350))
     assert field is not None
     assert field.radius == pytest.approx(350, abs=4)

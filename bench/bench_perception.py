@@ -1,0 +1,84 @@
+"""What an image costs segmentation_node's core, beside the floor: decoding the JPEG it came in."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from time import process_time
+from types import SimpleNamespace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from knee_gap_perception.camera import FisheyeCamera
+from knee_gap_perception.edge_detector import GapEdgeDetector
+from knee_gap_perception.edges import EdgeStatus
+from knee_gap_perception.messages import image_from_compressed
+from knee_gap_perception.overlay import draw_overlay
+from knee_gap_simulation.bench import Bench
+
+Result = TypeVar("Result")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the cost of an image in milliseconds of one core, median and 99th percentile."""
+    parser = argparse.ArgumentParser(prog="bench_perception", description=__doc__)
+    parser.add_argument("--level", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--images", type=int, default=45, help="pictures of the simulated knee, at 60 a second"
+    )
+    parser.add_argument("--rounds", type=int, default=6, help="times they are gone through, to and fro")
+    asked = parser.parse_args(argv)
+    cv2.setNumThreads(1)
+    bench = Bench(asked.level, asked.seed, duration_s=asked.images / 60.0, fps=60.0)
+    frames = list(bench.frames())
+    lens = bench.lens
+    camera = FisheyeCamera(
+        lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
+    )
+    detector = GapEdgeDetector()
+    detector.process(0, frames[0].image, camera)
+    detector.process(1, frames[1].image, camera)
+    detector.end_track()
+    decoding, following, valid = [], [], 0
+    order = [frame for turn in range(asked.rounds) for frame in (frames if turn % 2 == 0 else frames[-2::-1])]
+    for index, frame in enumerate(order):
+        message = SimpleNamespace(format="jpeg", data=frame.jpeg)
+        spent, image = timed(partial(image_from_compressed, message))
+        decoding.append(spent)
+        stamp = 16_666_667 * (index + 1)
+        spent, edges = timed(partial(detector.process, stamp, image, camera))
+        following.append(spent)
+        valid += edges.status is EdgeStatus.VALID
+    masking, mask = timed(detector.gap_mask)
+    drawing, _ = timed(partial(draw_overlay, order[-1].image, edges, mask, "", camera))
+    print(
+        f"{len(order)} images of {lens.width_px}x{lens.height_px}, level {asked.level}, "
+        f"{valid} valid, one core"
+    )
+    print(f"decoding alone   p50 {percentile(decoding, 50):5.1f} ms  p99 {percentile(decoding, 99):5.1f} ms")
+    print(
+        f"edges            p50 {percentile(following, 50):5.1f} ms  p99 {percentile(following, 99):5.1f} ms"
+    )
+    ratio = percentile(following, 50) / percentile(decoding, 50)
+    print(f"edges / decoding     {ratio:5.2f}")
+    print(f"mask, when asked for {1e3 * masking:5.1f} ms; overlay, when asked for {1e3 * drawing:.1f} ms")
+    return 0
+
+
+def timed(work: Callable[[], Result]) -> tuple[float, Result]:
+    """Seconds of the processor that work takes, and what it returns."""
+    start = process_time()
+    result = work()
+    return process_time() - start, result
+
+
+def percentile(seconds: list[float], share: float) -> float:
+    """A percentile of times [s] in milliseconds."""
+    return float(1e3 * np.percentile(seconds, share))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
