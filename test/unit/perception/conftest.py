@@ -68,7 +68,8 @@ class Joint:
         grey = cv2.GaussianBlur(grey, (0, 0), 0.7) + noise * np.random.default_rng(seed).standard_normal(
             grey.shape, np.float32
         )
-        return cv2.merge([np.clip(share * grey, 0, 255).astype(np.uint8) for share in (0.72, 0.82, 1.0)])
+        channels = [np.clip(share * grey, 0, 255).astype(np.uint8) for share in (0.72, 0.82, 1.0)]
+        return np.stack(channels, axis=2)
 
     def moved_pixels(self, T_from: Array, T_to: Array, pixels: npt.ArrayLike) -> Array:
         """Where the tissue behind pixels (n, 2) of one image is in another."""
