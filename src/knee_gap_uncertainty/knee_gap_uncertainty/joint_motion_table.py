@@ -23,34 +23,39 @@ from knee_gap_uncertainty.view_window import ViewWindow
 from knee_gap_uncertainty.views import Views
 
 DEVIATIONS_DEG = (0.1, 0.5, 1.18)
-HEADER = "{:8}  {:22}  {:12}  {:20}  {:>6}  {:>9}  {:>6}"
+HEADER = "{:8}  {:22}  {:12}  {:20}  {:>7}  {:>6}  {:>9}  {:>6}"
 HEADINGS = (
-    ("std of a", "errors of", "travel", "event", "tracks", "1st image", "images"),
-    ("bearing", "the bearings", "", "", "ended", "refused", "to end"),
+    ("std of a", "errors of", "travel", "event", "ended", "tracks", "1st image", "images"),
+    ("bearing", "the bearings", "", "", "before", "ended", "refused", "to end"),
 )
 
 
 class Outcome(NamedTuple):
     """One track: images from the event (or the start) to the end of the track, -1 where it did not end.
 
+    `too_early`: whether it ended before the event, which is a false alarm and no detection.
     `first_refused`: whether the first image of the event was already refused. `refused`: images refused.
     `statistics`: largest `first` and `shift` [-].
     """
 
     delay: int
+    too_early: bool
     first_refused: bool
     refused: int
     statistics: tuple[float, float]
 
 
 class Row(NamedTuple):
-    """A line of the table: shares of the tracks [-], and the median delay in images."""
+    """A line of the table: shares of the tracks [-], and the median delay in images.
+
+    `ended` and `first_refused` are shares of the tracks that did not end before the event.
+    """
 
     situation: Situation
+    too_early: float
     ended: float
     first_refused: float
     delay: float
-    refused: float
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -121,8 +126,9 @@ def follow(situation: Situation, image_count: int, rng: np.random.Generator) -> 
         finding = test.decide(found)
         first_refused |= i == event_at and finding is not Finding.STILL
         if finding is Finding.MOVED:
+            too_early = bool(situation.event) and i < event_at
             begin = event_at if i >= event_at else 0
-            return Outcome(i - begin + 1, first_refused, refused, largest)
+            return Outcome(i - begin + 1, too_early, first_refused, refused, largest)
         if finding is Finding.CONTRADICTION:
             refused += 1
         elif window.add(selected(views, [i])):
@@ -131,7 +137,7 @@ def follow(situation: Situation, image_count: int, rng: np.random.Generator) -> 
             fitted = fit(selected(views, kept)) if len(kept) > 1 else None
         else:
             passing = [i]
-    return Outcome(-1, first_refused, refused, largest)
+    return Outcome(-1, False, first_refused, refused, largest)
 
 
 def selected(views: Views, chosen: Sequence[int]) -> Views:
@@ -150,13 +156,15 @@ def selected(views: Views, chosen: Sequence[int]) -> Views:
 
 def measured(situation: Situation, outcomes: Sequence[Outcome]) -> Row:
     """Shares of the outcomes."""
-    delays = [outcome.delay for outcome in outcomes if outcome.delay > 0]
+    in_time = [outcome for outcome in outcomes if not outcome.too_early]
+    delays = [outcome.delay for outcome in in_time if outcome.delay > 0]
+    count = max(len(in_time), 1)
     return Row(
         situation,
-        ended=len(delays) / len(outcomes),
-        first_refused=float(np.mean([outcome.first_refused for outcome in outcomes])),
+        too_early=1.0 - len(in_time) / len(outcomes),
+        ended=len(delays) / count,
+        first_refused=sum(outcome.first_refused for outcome in in_time) / count,
         delay=float(np.median(delays)) if delays else float("nan"),
-        refused=float(np.mean([outcome.refused for outcome in outcomes])),
     )
 
 
@@ -175,6 +183,7 @@ def line(row: Row) -> str:
         noise,
         situation.travel,
         event,
+        f"{100 * row.too_early:.1f} %" if situation.event else "-",
         f"{100 * row.ended:.1f} %",
         f"{100 * row.first_refused:.1f} %" if situation.event else "-",
         f"{row.delay:.0f}" if situation.event else "-",
