@@ -16,9 +16,9 @@ from knee_gap_node.parameters import as_rows, declare, refuse_unknown
 
 Parameters = TypeVar("Parameters")
 
-# Images: whatever the camera offers, and never a queue of old ones. Four hold 67 ms at 60 Hz, which is what a
-# busy two-core machine needs to lose nothing.
-IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=4, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Images: whatever the camera offers, and never a growing queue of old ones. Eight hold 133 ms at 60 Hz, which
+# a two-core machine needs to lose nothing when another process takes its turn.
+IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Trackers publish best effort or reliable; a best-effort subscription hears both. 64 poses: 0.5 s at 120 Hz.
 TRACKER_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=64, reliability=ReliabilityPolicy.BEST_EFFORT)
 # What the suite says to itself and to a controller must arrive.
