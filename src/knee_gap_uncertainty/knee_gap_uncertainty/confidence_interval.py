@@ -55,7 +55,7 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
         fit.frames, fit.unknowns, fit.unknowns_covariance, float(norm.ppf(0.5 + 0.5 * level))
     )
     variation = fit.inverse_depth_variation
-    if variation > LARGEST_INVERSE_DEPTH_VARIATION:
+    if not variation <= LARGEST_INVERSE_DEPTH_VARIATION:
         reason = (
             f"relative error of inverse depth {variation:.2f} above {LARGEST_INVERSE_DEPTH_VARIATION}: "
             "the scope has to move further"

@@ -33,7 +33,10 @@ Mask = npt.NDArray[np.bool_]
 FLAT_PRIOR = 1e-12
 LARGEST_PASS_COUNT = 12
 LARGEST_RISE = 1.5
-LARGEST_CORRECTION = 0.9
+# Tangent of the angle from the mean bearing beyond which no point can be that all views saw.
+LARGEST_TANGENT = 100.0
+# Share of the information on an inverse depth that may be due to the errors of the lens positions.
+LARGEST_CORRECTION = 0.5
 # Squared length of the last step, in standard deviations of the estimate; what is left after it is far less.
 CONVERGED = 1e-4
 
@@ -172,10 +175,9 @@ def linearise(measured: Measured, used: Mask, unknowns: Array, out: Linearised) 
         for row in range(4):
             for column in range(4):
                 twice[row // 2, column // 2] += out.weights[i, row, column] * shared[row, column]
-    # Where the travel is of the size of its error no information would be left; the fit is then refused
-    # anyway.
     strength = 1.0
     for n in range(2):
+        out.information[3 * n + 2, 3 * n + 2] += FLAT_PRIOR
         if twice[n, n] > 0.0:
             strength = min(strength, LARGEST_CORRECTION * out.information[3 * n + 2, 3 * n + 2] / twice[n, n])
     for row in range(6):
@@ -185,16 +187,32 @@ def linearise(measured: Measured, used: Mask, unknowns: Array, out: Linearised) 
         for other in range(2):
             out.score[3 * n + 2] += strength * twice[n, other] * unknowns[other, 2]
             out.corrected[3 * n + 2, 3 * other + 2] -= strength * twice[n, other]
-        out.corrected[3 * n + 2, 3 * n + 2] += FLAT_PRIOR
     return cost
+
+
+@compiled
+def is_depth_lost(unknowns: Array, out: Linearised) -> bool:
+    """Whether no depth is in the data.
+
+    The travel is of the size of the errors of the lens positions: the correction of the information for those
+    was held at its limit, or has left none. Or the bearings contradict each other so far that the fit ran
+    off.
+    """
+    for n in range(2):
+        if not abs(unknowns[n, 0]) + abs(unknowns[n, 1]) < LARGEST_TANGENT:
+            return True
+    for k in (2, 5):
+        if out.corrected[k, k] <= (1.0 - LARGEST_CORRECTION) * out.information[k, k] * (1.0 + 1e-9):
+            return True
+    return not cholesky(out.corrected, np.zeros((6, 6)))
 
 
 @compiled
 def maximise(measured: Measured, used: Mask, unknowns: Array, out: Linearised, covariance: Array) -> float:
     """Gauss-Newton from `unknowns`, which it overwrites; a step that makes the fit far worse is halved.
 
-    Writes the inverse of the corrected information (6, 6) and returns the sum of the squared weighted
-    residuals.
+    Writes the inverse of the corrected information (6, 6), zero where there is none, and returns the sum of
+    the squared weighted residuals.
     """
     factor = np.zeros((6, 6))
     step = np.zeros(6)
@@ -212,7 +230,10 @@ def maximise(measured: Measured, used: Mask, unknowns: Array, out: Linearised, c
         best_cost = cost
         for k in range(6):
             unknowns[k // 3, k % 3] = trial[k // 3, k % 3]
-        if not cholesky(out.corrected, factor) or length < CONVERGED or last:
+        if not cholesky(out.corrected, factor) and not cholesky(out.information, factor):
+            covariance[:, :] = 0.0
+            return float(best_cost)
+        if length < CONVERGED or last:
             break
         solve_factored(factor, out.score, step)
         length = 0.0

@@ -12,7 +12,17 @@ import numpy.typing as npt
 
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
-from knee_gap_uncertainty.likelihood import Linearised, Measured, blank, maximise, mean_frames, start
+from knee_gap_uncertainty.likelihood import (
+    FLAT_PRIOR,
+    Linearised,
+    Measured,
+    blank,
+    is_depth_lost,
+    maximise,
+    mean_frames,
+    start,
+)
+from knee_gap_uncertainty.small_matrix import cholesky
 from knee_gap_uncertainty.variance_shares import considered_covariance, variance_shares
 from knee_gap_uncertainty.views import Views
 
@@ -34,6 +44,11 @@ MEDIAN_CHI_SQUARE_2 = 1.3863
 # Between these deviations of chi-square from its expectation the scale goes from 1 to the ratio of the two:
 # chance alone does not widen an interval, and the interval does not jump where evidence begins.
 SCALE_RAMP = (1.5, 2.5)
+# A share of exactly 1 would leave the bearings no error of their own, and their covariance without an
+# inverse.
+LARGEST_COMMON_SHARE = 0.99
+# An inverse depth [1/m] below which a point is as good as at infinity.
+AT_INFINITY = 1e-6
 # Where nearly all of the error is common, residuals say nothing of its scale, however small they should be.
 SMALLEST_EXPECTED_SHARE = 0.25
 
@@ -63,7 +78,7 @@ class MultiViewFit:
     the errors are as they were said to be; `scale` >= 1: what the covariances were multiplied by because of
     it. `used` (N, 2) is false for gated bearings; `residuals` (N, 2): their squared length in standard
     deviations. `shares` (4,): image, lens position, lens rotation and common part of the variance of the gap;
-    they sum to 1.
+    they sum to 1, and are NaN where there is no gap.
     """
 
     points: Array
@@ -88,9 +103,10 @@ class MultiViewFit:
     def inverse_depth_variation(self) -> float:
         """Larger relative standard deviation of the inverse depths [-]; infinite at or beyond infinity."""
         depths = self.unknowns[:, 2]
-        if not np.all(depths > 0.0):
+        if not np.all(depths > AT_INFINITY):
             return float("inf")
-        return float(np.max(np.sqrt(np.diag(self.unknowns_covariance)[[2, 5]]) / depths))
+        variances = np.diag(self.unknowns_covariance)[[2, 5]]
+        return float(np.max(np.sqrt(np.maximum(variances, 0.0)) / depths))
 
     @property
     def gap_deviation(self) -> float:
@@ -141,7 +157,7 @@ def fit(views: Views) -> MultiViewFit:
 def points_of(centre: Array, frames: Array, unknowns: Array) -> Array:
     """(2, 3) points [m] of the unknowns a, b, rho (2, 3); NaN for an inverse depth that is not above 0."""
     directions = frames[:, 0] + unknowns[:, :1] * frames[:, 1] + unknowns[:, 1:2] * frames[:, 2]
-    inverse_depth = np.where(unknowns[:, 2:] > 0.0, unknowns[:, 2:], np.nan)
+    inverse_depth = np.where(unknowns[:, 2:] > AT_INFINITY, unknowns[:, 2:], np.nan)
     return np.asarray(centre + directions / inverse_depth)
 
 
@@ -150,7 +166,7 @@ def points_jacobian(frames: Array, unknowns: Array) -> Array:
     jacobian = np.zeros((6, 6))
     for n in range(2):
         a, b, inverse_depth = unknowns[n]
-        inverse_depth = inverse_depth if inverse_depth > 0.0 else np.nan
+        inverse_depth = inverse_depth if inverse_depth > AT_INFINITY else np.nan
         direction = frames[n, 0] + a * frames[n, 1] + b * frames[n, 2]
         block = np.column_stack([frames[n, 1], frames[n, 2], -direction / inverse_depth]) / inverse_depth
         jacobian[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] = block
@@ -178,6 +194,7 @@ def fit_arrays(
 ) -> Fitted:
     """`fit` on plain arrays that were checked before; `lens_axes` as in Measured."""
     count = lens.shape[0]
+    share = min(common_share, LARGEST_COMMON_SHARE)
     centre = np.zeros(3)
     for i in range(count):
         for k in range(3):
@@ -208,10 +225,10 @@ def fit_arrays(
         allowed -= gated
         cost = maximise(measured, used, unknowns, out, inverse)
     covariance = np.zeros((6, 6))
-    expected = considered_covariance(out, common_share, inverse, covariance)
+    expected = considered_covariance(out, share, inverse, covariance)
     if count >= FEWEST_VIEWS_TO_GATE:
-        covariance *= price_of_gate(common_share)
-    shares = variance_shares(measured, out, unknowns, common_share, inverse)
+        covariance *= price_of_gate(share)
+    shares = variance_shares(measured, out, unknowns, share, inverse)
     dof = -6.0
     for i in range(count):
         dof += 2.0 * (used[i, 0] + used[i, 1])
@@ -221,6 +238,12 @@ def fit_arrays(
         ramp = ((ratio - 1.0) * np.sqrt(0.5 * dof) - SCALE_RAMP[0]) / (SCALE_RAMP[1] - SCALE_RAMP[0])
         scale += min(max(ramp, 0.0), 1.0) * (ratio - 1.0)
         covariance *= scale
+    if is_depth_lost(unknowns, out) or not cholesky(covariance, np.zeros((6, 6))):
+        for row in range(6):
+            for column in range(6):
+                covariance[row, column] = 1.0 if row == column else 0.0
+        for n in range(2):
+            covariance[3 * n + 2, 3 * n + 2] = 1.0 / FLAT_PRIOR + (10.0 * unknowns[n, 2]) ** 2
     return Fitted(centre, measured.frames, unknowns, covariance, used, residuals, ratio, scale, shares)
 
 
@@ -230,7 +253,7 @@ def price_of_gate(common_share: float) -> float:
 
     Residuals are of the independent part, the gate is set by the whole.
     """
-    half = 0.5 * GATE / max(1.0 - common_share, 1e-3)
+    half = 0.5 * GATE / (1.0 - common_share)
     return float(1.0 / (1.0 - np.exp(-half) * (1.0 + half)))
 
 

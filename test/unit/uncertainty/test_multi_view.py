@@ -7,6 +7,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from knee_gap_uncertainty.confidence_interval import confidence_interval
 from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
 from knee_gap_uncertainty.likelihood import Measured, blank, linearise, mean_frames
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit, points_jacobian, points_of
@@ -357,3 +358,52 @@ def test_result_is_complete_and_finite_for_very_many_views() -> None:
     assert fitted.view_count == 1000
     assert np.isfinite(fitted.covariance).all()
     assert np.linalg.eigvalsh(fitted.covariance).min() > 0.0
+
+
+@pytest.mark.parametrize("count", [3, 40, 240])
+def test_a_lens_that_only_seems_to_move_gives_no_depth(count: int) -> None:
+    """Its positions differ by their errors alone: however precise the bearings, nothing may be accepted."""
+    rng = np.random.default_rng(51)
+    lens = np.zeros((count, 3))
+    for _ in range(20):
+        measured = rng.standard_normal((count, 3)) * LENS_RMS / np.sqrt(3.0)
+        fitted = fit(views_of(measured, directions(lens), deviation=1e-5))
+        assert not fitted.inverse_depth_variation <= 0.3
+        assert confidence_interval(fitted).refused
+
+
+def test_nonsense_is_refused_or_answered_but_never_accepted_without_numbers() -> None:
+    rng = np.random.default_rng(52)
+    accepted = 0
+    for _ in range(1500):
+        count = int(rng.choice([2, 3, 4, 5, 10, 40]))
+        lens = rng.standard_normal((count, 3)) * 10.0 ** rng.uniform(-9.0, 0.0)
+        bearings = 10.0 ** rng.uniform(-3.0, 3.0) * rng.standard_normal((2, 3)) - lens[:, None]
+        kind = rng.integers(5)
+        if kind == 0:
+            bearings = rng.standard_normal((count, 2, 3))
+        elif kind == 1:
+            bearings = np.repeat(rng.standard_normal((1, 2, 3)), count, axis=0)
+        elif kind == 2:
+            bearings[::2] *= -1.0
+        elif kind == 3:
+            bearings[:, 1] = bearings[:, 0]
+        bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+        fitted = fit(
+            views_of(
+                lens,
+                bearings,
+                deviation=10.0 ** rng.uniform(-6.0, -0.4),
+                share=float(rng.choice([0.0, 0.5, 1.0])),
+                lens_covariances=isotropic_covariances(count, 10.0 ** rng.uniform(-8.0, -1.0)),
+                rotation_covariances=isotropic_covariances(count, 10.0 ** rng.uniform(-6.0, 0.0)),
+            )
+        )
+        interval = confidence_interval(fitted)
+        assert 0.0 <= interval.lower <= interval.upper
+        if not interval.refused:
+            accepted += 1
+            assert np.isfinite(fitted.covariance).all()
+            assert interval.lower <= fitted.gap * (1.0 + 1e-9)
+            assert fitted.gap <= interval.upper * (1.0 + 1e-9)
+    assert accepted > 50
