@@ -2,8 +2,7 @@
 
 A track is scored from its first image on: the surface points behind its first two pixels are its truth.
 Errors are told along and across the edge, in degrees; NEES is the squared error in units of its own
-seen.
-seen.
+covariance, against its expectation; held is the share of images with a valid track while both are to be seen.
 """
 
 import argparse

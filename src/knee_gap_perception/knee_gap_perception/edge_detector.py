@@ -11,6 +11,7 @@ from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, brightness
+from knee_gap_perception.foreign_bodies import foreign_bodies
 from knee_gap_perception.gap_confidence import gap_confidence
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
@@ -119,7 +120,8 @@ class GapEdgeDetector:
         if field is None:
             return np.zeros(shape, np.uint8)
         small, scale = self._working_size(self._image)
-        dark = self._segmentation(small, field.mask((small.shape[0], small.shape[1]), scale))
+        inside = field.mask((small.shape[0], small.shape[1]), scale)
+        dark = self._segmentation(small, inside & ~foreign_bodies(small))
         full = cv2.resize(dark.astype(np.uint8) * 255, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
 
@@ -213,8 +215,9 @@ class GapEdgeDetector:
         )
         value = brightness(small)
         self._check_light(value[inside])
-        dark = self._segmentation(small, inside)
-        section = find_section(dark, value, field, scale, self._region(field))
+        foreign = foreign_bodies(small)
+        dark = self._segmentation(small, inside & ~foreign)
+        section = find_section(dark, value, foreign, field, scale, self._region(field))
         if section is None:
             raise _NoPointsError(
                 EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"

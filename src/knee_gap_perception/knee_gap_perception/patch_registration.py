@@ -22,15 +22,17 @@ Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
+ONE_SIDED, FULL_SIDED = 0.55, 0.85  # share of that window on the surface: from no weight to full
 SMOOTHING = 1.3  # [px] standard deviation: what is finer is noise
 FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
 NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
+SPARKLE = 1.12  # the same for a pixel against its window: small highlights
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 8.0  # growth of the error's logarithm as the correlation falls below that
+DOUBT = 9.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
 NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
@@ -105,7 +107,10 @@ def surface_around(
     highlight = np.clip((mean / max(level, 1.0) - HIGHLIGHT) / 0.3, 0.0, 1.0)
     power = cv2.boxFilter(detail * detail, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     strength = np.sqrt(np.maximum(power, 0.0) / np.maximum(count, 1.0))
-    weight = (surface * (1.0 - 0.9 * highlight)).astype(np.float32)
+    # Beside an edge the window is one-sided: the shading towards a contour would pass for texture, and slide.
+    sided = np.clip((count / LOCAL_MEAN**2 - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
+    sparkle = np.clip((smooth / np.maximum(mean, 1.0) - SPARKLE) / 0.15, 0.0, 1.0)
+    weight = (surface * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
     faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
     return Surface(detail / (strength + faint), weight, (column, row))
 

@@ -42,14 +42,14 @@ class Section:
 
 
 def find_section(
-    dark: Mask, value: Image, field: FieldOfView, scale: float, region: tuple[Array, float]
+    dark: Mask, value: Image, foreign: Mask, field: FieldOfView, scale: float, region: tuple[Array, float]
 ) -> Section | None:
     """The best section through the dark pixels; None where no dark part has tissue on both sides.
 
-    `dark` and `value` (brightness of any kind) are (h, w) at working size, `scale` times the full one;
-    `region` is the centre [px] and radius [px] of the region of interest in the full image, in which the
-    disc's centre must lie. Of several dark parts the one with the largest disc is taken, discs nearer the
-    region's centre preferred.
+    `dark`, `value` (brightness) and `foreign` (what is no tissue) are (h, w) at working size, `scale` times
+    the full one; `region` is the centre [px] and radius [px] of the region of interest in the full image,
+    in which the disc's centre must lie. Of several dark parts the one with the largest disc is taken, discs
+    nearer the region's centre preferred.
     """
     opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
@@ -75,6 +75,7 @@ def find_section(
                 float(distance[row + 1, column + 1]),
                 part > 0,
                 value,
+                foreign,
                 field,
                 scale,
             )
@@ -88,7 +89,7 @@ def find_section(
 
 
 def _section_through(
-    centre: Array, radius: float, part: Mask, value: Image, field: FieldOfView, scale: float
+    centre: Array, radius: float, part: Mask, value: Image, foreign: Mask, field: FieldOfView, scale: float
 ) -> Section | None:
     """The narrowest way across the gap through a point at working size, with tissue at both ends."""
     angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
@@ -104,7 +105,10 @@ def _section_through(
         beyond = centre + sign * (first[:, None] + TISSUE_BEYOND) * directions
         full = (beyond + 0.5) / scale - 0.5
         depth = np.where(np.isfinite(full).all(axis=1), field.depth_inside(np.nan_to_num(full)), -1.0)
-        reach[:, side] = np.where(depth > 0, first, np.nan)
+        # An instrument or glare beside the gap is not its edge.
+        column, row = np.rint(np.nan_to_num(beyond)).astype(int).T
+        tissue = ~foreign[row.clip(0, part.shape[0] - 1), column.clip(0, part.shape[1] - 1)]
+        reach[:, side] = np.where((depth > 0) & tissue, first, np.nan)
     width = reach.sum(axis=1)
     if not np.isfinite(width).any():
         return None
