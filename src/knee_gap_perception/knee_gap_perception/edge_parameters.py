@@ -88,7 +88,7 @@ class EdgeParameters:
         },
     )
     maximum_angular_error: float = field(
-        default=0.05,
+        default=0.12,
         metadata={
             "description": "angular_error above which the points are not valid [rad]",
             "range": (0.001, 1.0),

@@ -20,9 +20,8 @@ TYPICAL_DISTANCE = 0.012  # [m] from lens to tissue in a joint
 DISTANCE_SPREAD = 0.6  # [-] standard deviation of the inverse distance, against the typical one
 SLOPE_SPREAD = 1.5  # [-] standard deviation of the tangent of the surface's slant
 SHAPE_NOISE = 0.03  # [-] of a patch's shape: the surface is not a plane
-WANDER = (
-    0.01  # [-] of m an image: keeps the plane open to correction, as errors of the pose are not independent
-)
+MEMORY = 0.15  # [-] travel, against the distance, over which registrations are taken for one observation
+LEAST_TRAVEL = 0.01  # [-] travel, against the distance, from which a registration tells anything new
 DIFFERENCE = 4.0  # [px] between the points whose images give the shape
 
 
@@ -60,11 +59,13 @@ class LocalPlane:
     def __init__(self, bearing: Array, view: View) -> None:
         """Start with a surface across the bearing (3,) at a typical distance."""
         self._first = view
+        self._learnt_at = view.T_world_lens[:3, 3]
         self.mean = bearing / TYPICAL_DISTANCE
         along = np.outer(bearing, bearing)
         self.covariance = (
             DISTANCE_SPREAD**2 * along + SLOPE_SPREAD**2 * (np.eye(3) - along)
         ) / TYPICAL_DISTANCE**2
+        self._prior_information = np.linalg.inv(self.covariance)
 
     def predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
         """Where a patch of an earlier view is seen from another; None outside the camera's model."""
@@ -85,14 +86,30 @@ class LocalPlane:
         covariance = jacobian @ self.covariance @ jacobian.T + noise
         return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian)
 
-    def learn(self, prediction: Prediction, found: Array, covariance: Array) -> None:
-        """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction."""
-        gain = self.covariance @ prediction.jacobian.T @ np.linalg.inv(prediction.covariance)
+    def learn(self, prediction: Prediction, found: Array, covariance: Array, view: View) -> None:
+        """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction.
+
+        Registrations of one patch are wrong in the same way: by the light that moved, by relief that is no
+        plane. They are no independent observations, however many images there are. So the plane forgets as
+        the lens travels, and takes in as much as it forgets: it knows what one registration from here tells.
+        """
+        lens = view.T_world_lens[:3, 3]
+        moved = float(np.linalg.norm(lens - self._learnt_at) * np.linalg.norm(self.mean))
+        if moved < LEAST_TRAVEL:
+            return
+        self._learnt_at = lens
+        kept = float(np.exp(-moved / MEMORY))
+        prior = np.linalg.inv(prediction.covariance)
+        told = (1.0 - kept) * (np.linalg.inv(covariance) - prior)
         predicted = np.concatenate([prediction.warp.position, prediction.warp.shape.reshape(-1)])
-        self.mean = self.mean + gain @ (found - predicted)
-        updated = self.covariance - gain @ (prediction.covariance - covariance) @ gain.T
-        wander = (WANDER * np.linalg.norm(self.mean)) ** 2 * np.eye(3)
-        self.covariance = (updated + updated.T) / 2 + wander
+        posterior = np.linalg.inv(prior + told)
+        change = (1.0 - kept) * posterior @ np.linalg.solve(covariance, found - predicted)
+        gain = self.covariance @ prediction.jacobian.T @ prior
+        self.mean = self.mean + gain @ change
+        updated = self.covariance - gain @ (prediction.covariance - posterior) @ gain.T
+        information = kept * np.linalg.inv((updated + updated.T) / 2) + (1.0 - kept) * self._prior_information
+        loosened = np.linalg.inv(information)
+        self.covariance = (loosened + loosened.T) / 2
 
     def _see(self, plane: Array, bearings: Array, anchor: View, view: View) -> Array:
         """Directions (n, 3) from a view of the plane's points that an anchor sees along bearings (n, 3)."""

@@ -139,9 +139,59 @@ def _normal_equations(
     return hessian, slope, told
 
 
+def _bilinear(texture: Float32, x: float, y: float) -> float:
+    """Texture at a place inside it."""
+    left, top = int(x), int(y)
+    fx, fy = x - left, y - top
+    upper = (1.0 - fx) * texture[top, left] + fx * texture[top, left + 1]
+    lower = (1.0 - fx) * texture[top + 1, left] + fx * texture[top + 1, left + 1]
+    return float((1.0 - fy) * upper + fy * lower)
+
+
+def _structures(patch: Float32, texture: Float32, weight: Float32, matrix: Array) -> tuple[Array, Array]:
+    """Structure tensors (2, 2): of the patch's gradients, and of them with the image's, drawn as the patch.
+
+    Noise is in the first, and in the second on the average only once in a product, so not at all.
+    """
+    rows, columns = texture.shape
+    own, cross = np.zeros((2, 2)), np.zeros((2, 2))
+    for i in range(patch.shape[0]):
+        for j in range(patch.shape[1]):
+            share = patch[i, j, 3]
+            if share <= 0.0:
+                continue
+            x = matrix[0, 0] * j + matrix[0, 1] * i + matrix[0, 2]
+            y = matrix[1, 0] * j + matrix[1, 1] * i + matrix[1, 2]
+            reach_x = abs(matrix[0, 0]) + abs(matrix[0, 1])
+            reach_y = abs(matrix[1, 0]) + abs(matrix[1, 1])
+            if not (reach_x <= x < columns - 1 - reach_x and reach_y <= y < rows - 1 - reach_y):
+                continue
+            m = share * weight[int(y + 0.5), int(x + 0.5)]
+            if m <= 0.0:
+                continue
+            ahead = bilinear(texture, x + matrix[0, 0], y + matrix[1, 0])
+            behind = bilinear(texture, x - matrix[0, 0], y - matrix[1, 0])
+            below = bilinear(texture, x + matrix[0, 1], y + matrix[1, 1])
+            above = bilinear(texture, x - matrix[0, 1], y - matrix[1, 1])
+            gx, gy = 0.5 * (ahead - behind), 0.5 * (below - above)
+            dx, dy = patch[i, j, 1], patch[i, j, 2]
+            own[0, 0] += m * dx * dx
+            own[0, 1] += m * dx * dy
+            own[1, 1] += m * dy * dy
+            cross[0, 0] += m * dx * gx
+            cross[0, 1] += 0.5 * m * (dx * gy + dy * gx)
+            cross[1, 1] += m * dy * gy
+    own[1, 0], cross[1, 0] = own[0, 1], cross[0, 1]
+    return own, cross
+
+
 # No fast arithmetic: the same pixels must give the same bits.
 sample = numba.njit(cache=True)(_sample)
 spread = numba.njit(cache=True)(_spread)
 normal_equations: Callable[[Float32, Float32, Float32, Array, float], tuple[Array, Array, Array]] = (
     numba.njit(cache=True)(_normal_equations)
+)
+bilinear = numba.njit(cache=True)(_bilinear)
+structures: Callable[[Float32, Float32, Float32, Array], tuple[Array, Array]] = numba.njit(cache=True)(
+    _structures
 )

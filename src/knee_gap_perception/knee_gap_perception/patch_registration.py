@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.patch_kernel import normal_equations
+from knee_gap_perception.patch_kernel import normal_equations, structures
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -32,11 +32,13 @@ SPARKLE = 1.12  # the same for a pixel against its window: small highlights
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 9.0  # growth of the error's logarithm as the correlation falls below that
+DOUBT = 6.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
 NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
 CONVERGED = 0.02  # [px]
+FINISHING = 2  # iterations in which only gradients count that both textures have
+LEAST_AGREEMENT = 0.05  # [-] share of them below which it is not told apart from none
 
 
 @dataclass(frozen=True)
@@ -164,23 +166,48 @@ class Patch:
         prior_information[:6, :6] = jacobian.T @ np.linalg.inv(prior) @ jacobian
         prior_information[6, 6] = 1.0 / GAIN_PRIOR**2
         warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
+        # Where the noise makes gradients, they pull as much as true ones but say nothing. Near the end the
+        # true part of them is known, and only that counts.
+        agreement, finishing = np.eye(7), 0
         for _ in range(MAXIMUM_ITERATIONS):
             hessian, slope, told = self._look(surface, warp, gain)
             precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2 * _doubt(told[2]))
-            posterior = hessian * precision + prior_information
-            step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
+            posterior = agreement @ hessian @ agreement.T * precision + prior_information
+            step = np.linalg.solve(posterior, agreement @ slope * precision - prior_information @ deviation)
             deviation += step
             gain = min(max(gain + float(step[6]), 0.3), 3.0)
             warp = _compose(warp, step[:6])
-            if (
+            still = (
                 np.abs(step[:2]).max() < CONVERGED
                 and np.abs(step[2:6]).max() * self.half_size < 5 * CONVERGED
-            ):
+            )
+            if finishing == FINISHING or (finishing and still):
                 converged = True
                 break
+            if finishing or still:
+                finishing += 1
+                agreement = self._agreement(surface, warp, float(told[2]))
         covariance = jacobian @ np.linalg.inv(posterior)[:6, :6] @ jacobian.T
         told = self._look(surface, warp, gain)[2]
         return Registration(warp, (covariance + covariance.T) / 2, float(told[2]), float(told[1]), converged)
+
+    def _agreement(self, surface: Surface, warp: Warp, correlation: float) -> Array:
+        """Matrix (7, 7) from the patch's gradients to the part of them that the image has as well.
+
+        With H the structure tensor of the patch and C that of patch and image, C H^-1, its eigenvalues held
+        to (0, 1]: C is the information on a shift that H pretends to be (instrumental variables).
+        """
+        own, cross = structures(self._pixels, surface.texture, surface.weight, self._matrix(surface, warp))
+        values, vectors = np.linalg.eigh(own + 1e-9 * (1.0 + np.trace(own)) * np.eye(2))
+        root = vectors * np.sqrt(values) @ vectors.T
+        inverse = vectors / np.sqrt(values) @ vectors.T
+        shares, axes = np.linalg.eigh(inverse @ cross @ inverse)
+        shared = root @ (axes * np.clip(shares, LEAST_AGREEMENT, 1.0)) @ axes.T @ inverse
+        agreement = np.eye(7)
+        agreement[:2, :2] = shared
+        agreement[2:6, 2:6] = np.kron(shared, np.eye(2))
+        agreement[6, 6] = min(max(correlation, LEAST_AGREEMENT), 1.0)
+        return agreement
 
     def _look(self, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
         return normal_equations(

@@ -36,7 +36,8 @@ FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch aw
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
 HANDOVER_ERROR = 0.50  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.40  # [px] below which no registration is believed
+REGISTRATION_FLOOR = 0.20  # [px] below which no registration is believed
+PARALLAX_ERROR = 0.005  # [-] of the parallax since the patch was taken: light that moves, relief that hides
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
@@ -167,6 +168,12 @@ class PointTrack:
         row, column = np.unravel_index(int((score - 0.3 * away**2).argmax()), score.shape)
         return Warp(warp.position + np.array([column - reach, row - reach], float), warp.shape)
 
+    def _parallax(self, prediction: Prediction, anchor: _Anchor) -> float:
+        """How far [px] the point has moved in the image because the lens moved; all of it without a pose."""
+        if self._plane is not None and prediction.jacobian.any():
+            return float(np.linalg.norm(prediction.jacobian[:2] @ self._plane.mean))
+        return float(np.linalg.norm(prediction.warp.position - anchor.pixel))
+
     def _coast(self, prediction: Prediction) -> Sighting:
         """The prediction alone, while the point is not seen."""
         self._unseen += 1
@@ -180,7 +187,8 @@ class PointTrack:
         self, index: int, found: Registration, prediction: Prediction, surface: Surface, view: View | None
     ) -> Sighting:
         anchor = self._anchors[index]
-        covariance = anchor.covariance + found.covariance[:2, :2] + REGISTRATION_FLOOR**2 * np.eye(2)
+        floor = REGISTRATION_FLOOR**2 + (PARALLAX_ERROR * self._parallax(prediction, anchor)) ** 2
+        covariance = anchor.covariance + found.covariance[:2, :2] + floor * np.eye(2)
         moved = found.warp.position - self._warp.position
         self._velocity = np.zeros(2) if self._unseen else 0.5 * self._velocity + 0.5 * moved
         self._unseen = 0
@@ -188,7 +196,7 @@ class PointTrack:
         self._covariance = covariance
         if self._plane is not None and view is not None:
             parameters = np.concatenate([found.warp.position, found.warp.shape.reshape(-1)])
-            self._plane.learn(prediction, parameters, found.covariance)
+            self._plane.learn(prediction, parameters, found.covariance, view)
         newest = index == len(self._anchors) - 1
         strained = _strain(found.warp.shape) > MILD or found.correlation < FRESH
         clear = found.correlation > GOOD and found.seen > CLEAR
