@@ -148,13 +148,16 @@ def _bilinear(texture: Float32, x: float, y: float) -> float:
     return float((1.0 - fy) * upper + fy * lower)
 
 
-def _structures(patch: Float32, texture: Float32, weight: Float32, matrix: Array) -> tuple[Array, Array]:
-    """Structure tensors (2, 2): of the patch's gradients, and of them with the image's, drawn as the patch.
+def _structures(
+    patch: Float32, texture: Float32, weight: Float32, matrix: Array, blocks: int
+) -> tuple[Array, Array]:
+    """Structure tensors (blocks, blocks, 2, 2): of the patch's gradients, and of them with the image's.
 
-    Noise is in the first, and in the second on the average only once in a product, so not at all.
+    The image's are drawn as the patch. Noise is in the first, and in the second on the average only once in
+    a product, so not at all.
     """
     rows, columns = texture.shape
-    own, cross = np.zeros((2, 2)), np.zeros((2, 2))
+    owns, crosses = np.zeros((blocks, blocks, 2, 2)), np.zeros((blocks, blocks, 2, 2))
     for i in range(patch.shape[0]):
         for j in range(patch.shape[1]):
             share = patch[i, j, 3]
@@ -175,14 +178,16 @@ def _structures(patch: Float32, texture: Float32, weight: Float32, matrix: Array
             above = bilinear(texture, x - matrix[0, 1], y - matrix[1, 1])
             gx, gy = 0.5 * (ahead - behind), 0.5 * (below - above)
             dx, dy = patch[i, j, 1], patch[i, j, 2]
+            block = (i * blocks // patch.shape[0], j * blocks // patch.shape[1])
+            own, cross = owns[block], crosses[block]
             own[0, 0] += m * dx * dx
             own[0, 1] += m * dx * dy
             own[1, 1] += m * dy * dy
             cross[0, 0] += m * dx * gx
             cross[0, 1] += 0.5 * m * (dx * gy + dy * gx)
             cross[1, 1] += m * dy * gy
-    own[1, 0], cross[1, 0] = own[0, 1], cross[0, 1]
-    return own, cross
+    owns[:, :, 1, 0], crosses[:, :, 1, 0] = owns[:, :, 0, 1], crosses[:, :, 0, 1]
+    return owns, crosses
 
 
 # No fast arithmetic: the same pixels must give the same bits.
@@ -192,6 +197,6 @@ normal_equations: Callable[[Float32, Float32, Float32, Array, float], tuple[Arra
     numba.njit(cache=True)(_normal_equations)
 )
 bilinear = numba.njit(cache=True)(_bilinear)
-structures: Callable[[Float32, Float32, Float32, Array], tuple[Array, Array]] = numba.njit(cache=True)(
+structures: Callable[[Float32, Float32, Float32, Array, int], tuple[Array, Array]] = numba.njit(cache=True)(
     _structures
 )

@@ -38,7 +38,8 @@ NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring
 MAXIMUM_ITERATIONS = 12
 CONVERGED = 0.02  # [px]
 FINISHING = 2  # iterations in which only gradients count that both textures have
-LEAST_AGREEMENT = 0.05  # [-] share of them below which it is not told apart from none
+BLOCKS = 3  # a side, in which that is told apart
+CHANCE = 0.1  # [-] share of them that two textures of mere noise have in common
 
 
 @dataclass(frozen=True)
@@ -168,12 +169,12 @@ class Patch:
         warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
         # Where the noise makes gradients, they pull as much as true ones but say nothing. Near the end the
         # true part of them is known, and only that counts.
-        agreement, finishing = np.eye(7), 0
+        pixels, finishing = self._pixels, 0
         for _ in range(MAXIMUM_ITERATIONS):
-            hessian, slope, told = self._look(surface, warp, gain)
+            hessian, slope, told = self._look(pixels, surface, warp, gain)
             precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2 * _doubt(told[2]))
-            posterior = agreement @ hessian @ agreement.T * precision + prior_information
-            step = np.linalg.solve(posterior, agreement @ slope * precision - prior_information @ deviation)
+            posterior = hessian * precision + prior_information
+            step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
             deviation += step
             gain = min(max(gain + float(step[6]), 0.3), 3.0)
             warp = _compose(warp, step[:6])
@@ -186,33 +187,38 @@ class Patch:
                 break
             if finishing or still:
                 finishing += 1
-                agreement = self._agreement(surface, warp, float(told[2]))
+                pixels = self._agreed(surface, warp)
         covariance = jacobian @ np.linalg.inv(posterior)[:6, :6] @ jacobian.T
-        told = self._look(surface, warp, gain)[2]
+        told = self._look(self._pixels, surface, warp, gain)[2]
         return Registration(warp, (covariance + covariance.T) / 2, float(told[2]), float(told[1]), converged)
 
-    def _agreement(self, surface: Surface, warp: Warp, correlation: float) -> Array:
-        """Matrix (7, 7) from the patch's gradients to the part of them that the image has as well.
+    def _agreed(self, surface: Surface, warp: Warp) -> Float32:
+        """The patch's pixels with its gradients cut down to the part that the image has as well.
 
-        With H the structure tensor of the patch and C that of patch and image, C H^-1, its eigenvalues held
-        to (0, 1]: C is the information on a shift that H pretends to be (instrumental variables).
+        Block by block: with H the structure tensor of the patch and C that of patch and image, a gradient g
+        becomes C H^-1 g, with eigenvalues from 0 to 1. The information on a shift is then C H^-1 C, and what
+        noise alone pulls to vanishes on the average (instrumental variables).
         """
-        own, cross = structures(self._pixels, surface.texture, surface.weight, self._matrix(surface, warp))
-        values, vectors = np.linalg.eigh(own + 1e-9 * (1.0 + np.trace(own)) * np.eye(2))
-        root = vectors * np.sqrt(values) @ vectors.T
-        inverse = vectors / np.sqrt(values) @ vectors.T
-        shares, axes = np.linalg.eigh(inverse @ cross @ inverse)
-        shared = root @ (axes * np.clip(shares, LEAST_AGREEMENT, 1.0)) @ axes.T @ inverse
-        agreement = np.eye(7)
-        agreement[:2, :2] = shared
-        agreement[2:6, 2:6] = np.kron(shared, np.eye(2))
-        agreement[6, 6] = min(max(correlation, LEAST_AGREEMENT), 1.0)
-        return agreement
-
-    def _look(self, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
-        return normal_equations(
-            self._pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain
+        own, cross = structures(
+            self._pixels, surface.texture, surface.weight, self._matrix(surface, warp), BLOCKS
         )
+        trace = np.trace(own, axis1=2, axis2=3)[..., None, None]
+        values, vectors = np.linalg.eigh(own + 1e-6 * (1.0 + trace) * np.eye(2))
+        turned = np.swapaxes(vectors, -1, -2)
+        root = (vectors * np.sqrt(values)[..., None, :]) @ turned
+        inverse = (vectors / np.sqrt(values)[..., None, :]) @ turned
+        shares, axes = np.linalg.eigh(inverse @ cross @ inverse)
+        shares = np.clip((shares - CHANCE) / (1.0 - CHANCE), 0.0, 1.0)
+        agreement = root @ ((axes * shares[..., None, :]) @ np.swapaxes(axes, -1, -2)) @ inverse
+        block = np.arange(self._pixels.shape[0]) * BLOCKS // self._pixels.shape[0]
+        pixels = self._pixels.copy()
+        pixels[..., 1:3] = np.einsum("ijkl,ijl->ijk", agreement[np.ix_(block, block)], self._pixels[..., 1:3])
+        return pixels
+
+    def _look(
+        self, pixels: Float32, surface: Surface, warp: Warp, gain: float
+    ) -> tuple[Array, Array, Array]:
+        return normal_equations(pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain)
 
     def _matrix(self, surface: Surface, warp: Warp) -> Array:
         """Matrix (2, 3) from a pixel of the patch (column, row) to one of the crop."""
