@@ -32,7 +32,7 @@ SPARKLE = 1.12  # the same for a pixel against its window: small highlights
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 6.0  # growth of the error's logarithm as the correlation falls below that
+DOUBT = 7.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
 NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
@@ -215,9 +215,7 @@ class Patch:
         pixels[..., 1:3] = np.einsum("ijkl,ijl->ijk", agreement[np.ix_(block, block)], self._pixels[..., 1:3])
         return pixels
 
-    def _look(
-        self, pixels: Float32, surface: Surface, warp: Warp, gain: float
-    ) -> tuple[Array, Array, Array]:
+    def _look(self, pixels: Float32, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
         return normal_equations(pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain)
 
     def _matrix(self, surface: Surface, warp: Warp) -> Array:

@@ -31,13 +31,15 @@ MILD = (
 FRESH = 0.80  # correlation above which a patch needs no successor
 GOOD = 0.70  # correlation from which a new patch may be taken
 CLEAR = 0.85  # share of the patch that must be seen, free of highlights, to take a new one
-FAIR = 0.40  # correlation below which the point is not seen, where the pose tells where it must be
+FAIR = 0.45  # correlation below which the point is not seen, where the pose tells where it must be
+FAIR_WIDE = 0.65  # the same where the pose hardly tells, and the point is looked for all around
+WIDE = 6.0  # [px] standard deviation of the place that the pose tells, from which it hardly does
 FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
 HANDOVER_ERROR = 0.50  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.20  # [px] below which no registration is believed
-PARALLAX_ERROR = 0.005  # [-] of the parallax since the patch was taken: light that moves, relief that hides
+REGISTRATION_FLOOR = 0.15  # [px] below which no registration is believed
+PARALLAX_ERROR = 0.006  # [-] of the parallax since the patch was taken: light that moves, relief that hides
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
@@ -111,7 +113,7 @@ class PointTrack:
             anchor = self._anchors[index]
             start = self._coarse(anchor.patch, surface, prediction)
             found = anchor.patch.find(surface, start, prediction.covariance)
-            believed = _believable(found, prediction, FAIR if self._posed(view) else FAIR_ALONE)
+            believed = _believable(found, prediction, self._fair(view, prediction))
             anchor.rest = 0 if believed else REST
             if believed:
                 best = (index, found)
@@ -130,8 +132,12 @@ class PointTrack:
         newest = len(self._anchors) - 1
         return list(dict.fromkeys([*mild[:1], newest]))
 
-    def _posed(self, view: View | None) -> bool:
-        return self._plane is not None and view is not None
+    def _fair(self, view: View | None, prediction: Prediction) -> float:
+        """Correlation below which a patch was not found: in a wide search mere noise finds a likeness."""
+        if self._plane is None or view is None:
+            return FAIR_ALONE
+        width = min(_spread(prediction) / WIDE, 1.0)
+        return FAIR + (FAIR_WIDE - FAIR) * width
 
     def _predict(self, index: int, camera: Camera, view: View | None) -> Prediction:
         anchor = self._anchors[index]
@@ -156,8 +162,7 @@ class PointTrack:
         matrix = np.concatenate([inverse, (centre - inverse @ centre)[:, None]], axis=1)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         drawn = cv2.warpAffine(patch.texture * patch.weight, matrix, (side, side), flags=flags)
-        spread = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
-        reach = int(np.clip(np.ceil(3.0 * spread), 3, SEARCH))
+        reach = int(np.clip(np.ceil(3.0 * _spread(prediction)), 3, SEARCH))
         first = np.rint(warp.position - np.array(surface.origin)).astype(int) - PATCH_HALF - reach
         window = np.s_[first[1] : first[1] + side + 2 * reach, first[0] : first[0] + side + 2 * reach]
         score = cv2.matchTemplate(
@@ -212,6 +217,11 @@ def _level(grey: Image, position: Array) -> float:
     row, column = round(float(position[1])), round(float(position[0]))
     patch = grey[max(0, row - 24) : row + 25 : 4, max(0, column - 24) : column + 25 : 4]
     return float(np.percentile(patch, 75)) if patch.size else 0.0
+
+
+def _spread(prediction: Prediction) -> float:
+    """Standard deviation [px] of a predicted position, in its worse direction."""
+    return float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
 
 
 def _strain(shape: Array) -> float:
