@@ -7,9 +7,7 @@ import numpy.typing as npt
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
-NEUTRAL = (
-    0.06  # [-] red above blue, against the brightest channel, below which a colour is that of metal or lamp
-)
+NEUTRAL = 0.06  # [-] red above blue, against the brightest channel: below it is metal or the lamp
 LIT = 45  # [grey levels] below which no colour can be told
 SMALLEST = 3  # [px at working size] side of what is not noise
 MARGIN = 2  # [px at working size] of the blurred border around it
@@ -18,8 +16,8 @@ MARGIN = 2  # [px at working size] of the blurred border around it
 def foreign_bodies(image: Image) -> Mask:
     """Pixels (h, w) of an image (h, w, 3) at working size that show metal or glare.
 
-    Living tissue sends back more red than blue, even pale cartilage; steel and the lamp's own reflection do not.
-    A picture without colour (a grey camera) has neither.
+    Living tissue sends back more red than blue, even pale cartilage; steel and the lamp's own reflection do
+    not. A picture without colour (a grey camera) has neither.
     """
     blue, green, red = (channel.astype(np.int16) for channel in cv2.split(image))
     value = np.maximum(np.maximum(blue, green), red)

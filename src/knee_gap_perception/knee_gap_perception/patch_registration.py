@@ -32,7 +32,7 @@ SPARKLE = 1.12  # the same for a pixel against its window: small highlights
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 7.0  # growth of the error's logarithm as the correlation falls below that
+DOUBT = 5.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
 NOISE_CORRELATION = 3.0  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
@@ -170,7 +170,7 @@ class Patch:
         # Where the noise makes gradients, they pull as much as true ones but say nothing. Near the end the
         # true part of them is known, and only that counts.
         pixels, finishing = self._pixels, 0
-        for _ in range(MAXIMUM_ITERATIONS):
+        for turn in range(MAXIMUM_ITERATIONS):
             hessian, slope, told = self._look(pixels, surface, warp, gain)
             precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2 * _doubt(told[2]))
             posterior = hessian * precision + prior_information
@@ -185,7 +185,7 @@ class Patch:
             if finishing == FINISHING or (finishing and still):
                 converged = True
                 break
-            if finishing or still:
+            if finishing or still or turn >= MAXIMUM_ITERATIONS - 1 - FINISHING:
                 finishing += 1
                 pixels = self._agreed(surface, warp)
         covariance = jacobian @ np.linalg.inv(posterior)[:6, :6] @ jacobian.T
@@ -211,7 +211,7 @@ class Patch:
         shares = np.clip((shares - CHANCE) / (1.0 - CHANCE), 0.0, 1.0)
         agreement = root @ ((axes * shares[..., None, :]) @ np.swapaxes(axes, -1, -2)) @ inverse
         block = np.arange(self._pixels.shape[0]) * BLOCKS // self._pixels.shape[0]
-        pixels = self._pixels.copy()
+        pixels: Float32 = self._pixels.copy()
         pixels[..., 1:3] = np.einsum("ijkl,ijl->ijk", agreement[np.ix_(block, block)], self._pixels[..., 1:3])
         return pixels
 
