@@ -211,6 +211,7 @@ class GapEdgeDetector:
         if self._track is None:
             sightings = self._start(stamp_ns, picture, grey, camera, view, field)
         else:
+            self._check_light_while_tracking(stamp_ns, picture, field)
             sightings = self._follow(stamp_ns, grey, camera, view, field)
         edges = self._edges(stamp_ns, frame_id, camera, sightings)
         first, second = sightings
@@ -294,6 +295,20 @@ class GapEdgeDetector:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
         if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+
+    def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
+        """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.
+
+        The track goes on after a short one, as after a point that was hidden.
+        """
+        rows, columns = np.mgrid[8 : picture.shape[0] : 16, 8 : picture.shape[1] : 16]
+        inside = field.depth_inside(np.stack([columns, rows], axis=-1)) > 0
+        try:
+            self._check_light(picture[8::16, 8::16].max(axis=2)[inside])
+        except _NoPointsError:
+            if stamp_ns - self._seen_ns > 1e9 * self.parameters.maximum_unseen:
+                self.end_track()
+            raise
 
     def _region(self, field: FieldOfView) -> tuple[Array, float]:
         """Centre and radius [px] of the region of interest."""
