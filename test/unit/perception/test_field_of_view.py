@@ -96,7 +96,7 @@ def test_stream_keeps_the_disc_through_dark_images_and_finds_a_new_one_for_a_new
 
 
 @pytest.mark.parametrize(
-    ("centre", "radius"), [((640, 360), 350), ((640, 360), 120), ((340, 530), 180)], ids=str
+    ("centre", "radius"), [((640, 360), 350), ((640, 360), 180), ((340, 530), 180)], ids=str
 )
 def test_a_disc_that_grows_shrinks_or_moves_is_found_anew(centre: tuple[int, int], radius: int) -> None:
     finder = FieldOfViewFinder()
