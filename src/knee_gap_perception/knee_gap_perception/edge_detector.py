@@ -1,6 +1,6 @@
 """From the images of a scope to the two points of the gap: find it, choose the points, follow them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,11 +39,13 @@ class _NoPointsError(Exception):
 
 @dataclass(frozen=True)
 class _Track:
-    """Two points being followed, and when both were last seen [ns]."""
+    """Two points being followed; `pose_frame` is that of the lens poses from its first image on, if any."""
 
     track_id: int
     points: tuple[PointTrack, PointTrack]
     kinds: tuple[EdgeKind, EdgeKind]
+    pose_frame: str | None
+    clicked: Array | None
 
 
 class GapEdgeDetector:
@@ -66,7 +68,9 @@ class GapEdgeDetector:
         self._thumbnail: Image | None = None
         self._identical = 0
         self._clicked: Array | None = None
+        self._pose_frame = ""
         self._reason = "no image was looked at yet"
+        self._confidence = float("nan")
         # OpenCV's threads would fight with the other nodes for a gain of nothing at these sizes.
         cv2.setNumThreads(1)
 
@@ -74,6 +78,11 @@ class GapEdgeDetector:
     def reason(self) -> str:
         """Why the last image gave no valid points, in words; empty where it did."""
         return self._reason
+
+    @property
+    def confidence(self) -> float:
+        """Confidence [0, 1] of the last search that its dark part is a gap; NaN where it found none."""
+        return self._confidence
 
     def end_track(self) -> None:
         """Forget the points; the next image starts a new track."""
@@ -83,6 +92,26 @@ class GapEdgeDetector:
         """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
         self._clicked = np.asarray(pixel, dtype=np.float64)
         self.end_track()
+
+    def choose_near(self, pixel: npt.ArrayLike, camera: Camera) -> str:
+        """As `choose_at`, if the last image shows a gap there; otherwise nothing changes. Returns why not, or ""."""
+        if self._image is None:
+            return "no image received yet"
+        clicked, before = np.asarray(pixel, dtype=np.float64), self._clicked
+        height, width = self._image.shape[:2]
+        if not (np.isfinite(clicked).all() and (clicked >= -0.5).all() and (clicked < [width, height]).all()):
+            return f"the point must lie in the image of {width}x{height} px, not at {clicked[0]:g}, {clicked[1]:g}"
+        field = self._finder.find(self._image)
+        if field is None or field.depth_inside(clicked) <= 0:
+            return "the point lies outside the field of view"
+        self._clicked = clicked
+        try:
+            self._section(self._image, camera, field)
+        except (_NoPointsError, PerceptionError) as refusal:
+            self._clicked = before
+            return str(refusal)
+        self.choose_at(clicked)
+        return ""
 
     def process(
         self,
@@ -100,6 +129,8 @@ class GapEdgeDetector:
         try:
             picture = self._checked(stamp_ns, image, camera)
             view = View.of(lens_pose) if lens_pose is not None else None
+            if lens_pose is not None:
+                self._settle_frame(lens_pose.frame_id)
             edges = self._points(stamp_ns, picture, camera, view, frame_id)
             self._reason = ""
         except _NoPointsError as refusal:
@@ -180,8 +211,22 @@ class GapEdgeDetector:
         if self._track is None:
             sightings = self._start(stamp_ns, picture, grey, camera, view, field)
         else:
+            self._check_light_while_tracking(stamp_ns, picture, field)
             sightings = self._follow(stamp_ns, grey, camera, view, field)
-        return self._edges(stamp_ns, frame_id, camera, sightings)
+        edges = self._edges(stamp_ns, frame_id, camera, sightings)
+        first, second = sightings
+        return replace(edges, hidden=(not first.seen, not second.seen), pose_used=view is not None)
+
+    def _settle_frame(self, pose_frame: str) -> None:
+        """Let the track be begun anew where it cannot use poses in a frame.
+
+        It was begun without any, before the tracker's first pose or while the tracker saw nothing; or with
+        poses in another frame, as when the reference body changes.
+        """
+        self._pose_frame = pose_frame
+        if self._track is not None and self._track.pose_frame != pose_frame:
+            self._clicked = self._track.clicked
+            self.end_track()
 
     def _start(
         self,
@@ -202,13 +247,20 @@ class GapEdgeDetector:
             )
         first, second = (PointTrack(grey, point.pixel, point.dark_below, camera, view) for point in points)
         self._tracks += 1
-        self._clicked = None
         self._seen_ns = stamp_ns
-        self._track = _Track(self._tracks, (first, second), (points[0].kind, points[1].kind))
+        self._track = _Track(
+            self._tracks,
+            (first, second),
+            (points[0].kind, points[1].kind),
+            self._pose_frame if view is not None else None,
+            self._clicked,
+        )
+        self._clicked = None
         return [first.first, second.first]
 
     def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:
         """The section of the gap; raises _NoPointsError where the picture shows none."""
+        self._confidence = float("nan")
         small, scale = self._working_size(picture)
         inside = field.mask(
             (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
@@ -229,7 +281,7 @@ class GapEdgeDetector:
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
-        confidence = gap_confidence(section, field.extent, small, dark)
+        confidence = self._confidence = gap_confidence(section, field.extent, small, dark)
         if confidence < self.parameters.minimum_confidence:
             raise _NoPointsError(
                 EdgeStatus.NO_GAP,
@@ -243,6 +295,20 @@ class GapEdgeDetector:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
         if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+
+    def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
+        """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.
+
+        The track goes on after a short one, as after a point that was hidden.
+        """
+        rows, columns = np.mgrid[8 : picture.shape[0] : 16, 8 : picture.shape[1] : 16]
+        inside = field.depth_inside(np.stack([columns, rows], axis=-1)) > 0
+        try:
+            self._check_light(picture[8::16, 8::16].max(axis=2)[inside])
+        except _NoPointsError:
+            if stamp_ns - self._seen_ns > 1e9 * self.parameters.maximum_unseen:
+                self.end_track()
+            raise
 
     def _region(self, field: FieldOfView) -> tuple[Array, float]:
         """Centre and radius [px] of the region of interest."""

@@ -67,7 +67,7 @@ class EdgeParameters:
         },
     )
     minimum_width: float = field(
-        default=0.03,
+        default=0.08,
         metadata={
             "description": "Angle across the gap below which it is no gap [rad]",
             "range": (0.001, 1.0),

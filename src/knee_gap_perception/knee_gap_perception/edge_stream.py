@@ -1,7 +1,12 @@
-"""The images of one scope, as messages, to the edges in each: all of segmentation_node but ROS."""
+"""The images and lens poses of one scope, as messages, to the edges in each image: segmentation_node but ROS.
 
-from collections import Counter
-from typing import Any
+An image may wait a little for the lens pose that follows it, so that the pose at its stamp is interpolated
+and not foretold. It waits for nothing else, and not where no pose is to be expected.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 from knee_gap_perception.camera import Camera, camera_from_info
 from knee_gap_perception.edge_detector import GapEdgeDetector
@@ -17,14 +22,28 @@ from knee_gap_perception.messages import (
     stamp_ns,
 )
 from knee_gap_perception.overlay import draw_overlay
+from knee_gap_perception.segmentation_parameters import PoseParameters
 
 NO_CAMERA = "no camera_info received yet"
+# At 60 Hz and the longest wait no more images wait than these; of a faster camera the oldest waits no longer.
+MOST_WAITING = 8
+
+
+class _Waiting(NamedTuple):
+    """An image that waits for a lens pose, and when it arrived [ns]."""
+
+    message: Any
+    stamp_ns: int
+    arrival_ns: int
 
 
 class EdgeStream:
-    """Takes sensor_msgs by field name; whatever is wrong with one is a status, a reason and a count."""
+    """Takes messages by field name; whatever is wrong with one is a status, a reason and a count.
 
-    def __init__(self, parameters: EdgeParameters | None = None) -> None:
+    Images are handed in by `on_image` and come out, in order, as edges from `ready`.
+    """
+
+    def __init__(self, parameters: EdgeParameters | None = None, poses: PoseParameters | None = None) -> None:
         self.detector = GapEdgeDetector(parameters)
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
@@ -32,8 +51,15 @@ class EdgeStream:
         self._image: Image | None = None
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
-        self._poses = LensPosePredictor()
         self._camera_key: tuple[object, ...] = ()
+        self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
+        self._poses = LensPosePredictor()
+        self._waiting: deque[_Waiting] = deque()
+
+    @property
+    def waiting(self) -> int:
+        """Number of images that wait for a lens pose."""
+        return len(self._waiting)
 
     def on_camera_info(self, message: Any) -> None:
         """Take the camera model of a sensor_msgs/CameraInfo; one that differs ends the track."""
@@ -52,11 +78,34 @@ class EdgeStream:
         """Take a pose of the lens, a geometry_msgs/PoseWithCovarianceStamped; a bad one is left out."""
         try:
             self._poses.add(lens_pose_from_message(message))
-        except PerceptionError as error:
-            self.counts[f"lens pose refused: {error}"] += 1
+        except PerceptionError:
+            self.counts["lens poses refused"] += 1
 
-    def on_image(self, message: Any) -> GapEdges:
-        """Edges in a sensor_msgs/Image or sensor_msgs/CompressedImage."""
+    def on_image(self, message: Any, now_ns: int = 0) -> None:
+        """Take a sensor_msgs/Image or sensor_msgs/CompressedImage that arrives at a time [ns]."""
+        self._waiting.append(_Waiting(message, stamp_ns(message.header), now_ns))
+
+    def ready(self, now_ns: int = 0) -> Iterator[GapEdges]:
+        """Edges of the images that need not wait at a time [ns]; each image is looked at when it is asked for.
+
+        Until the next is asked for, `latest`, `reason`, `detector` and `overlay` speak of the one just given.
+        """
+        while self._waiting:
+            waiting = self._waiting[0]
+            waited_ns = now_ns - waiting.arrival_ns
+            # A clock that ran backwards tells nothing of the wait.
+            in_time = 0 <= waited_ns < self._wait_ns and len(self._waiting) <= MOST_WAITING
+            if in_time and self._poses.expects_after(waiting.stamp_ns):
+                return
+            self._waiting.popleft()
+            yield self._look(waiting.message)
+
+    def finish(self) -> Iterator[GapEdges]:
+        """Edges of the images for which no pose will come any more."""
+        while self._waiting:
+            yield self._look(self._waiting.popleft().message)
+
+    def _look(self, message: Any) -> GapEdges:
         stamp, frame_id = stamp_ns(message.header), str(message.header.frame_id)
         try:
             is_compressed = hasattr(message, "format")
@@ -73,7 +122,17 @@ class EdgeStream:
             self.reason = str(error)
         self.latest = edges
         self.counts[edges.status.name] += 1
+        if edges.pose_used:
+            self.counts["with the pose of the lens"] += 1
+        if edges.status is EdgeStatus.VALID and any(edges.hidden):
+            self.counts["VALID, a point hidden"] += 1
         return edges
+
+    def choose(self, column: float, row: float) -> str:
+        """Begin anew at the gap nearest to a pixel of the last image; returns why not, or "" where it is done."""
+        if self._camera is None:
+            return self._camera_flaw
+        return self.detector.choose_near([column, row], self._camera)
 
     def overlay(self) -> Image | None:
         """The last image with all that was found drawn on it; None before the first."""

@@ -231,7 +231,7 @@ class FieldOfViewFinder:
     REFRESH_EVERY = (
         120  # images after which a disc is found anew: the camera turns and shifts on the eyepiece
     )
-    CHECK_EVERY = 4  # images, of which one is looked at for picture outside the disc
+    CHECK_EVERY = 4  # images, of which one is looked at for picture where there should be none, and the reverse
     MISFITS = 3  # of these in a row, after which the disc is found anew
 
     def __init__(self) -> None:
@@ -247,7 +247,7 @@ class FieldOfViewFinder:
         self._age += 1
         if self._field is not None and np.isfinite(self._field.radius):
             if self._age % self.CHECK_EVERY == 0:
-                self._misfits = self._misfits + 1 if self._picture_outside(image) else 0
+                self._misfits = self._misfits + 1 if self._misfit(image) else 0
             if self._misfits < self.MISFITS and self._age % self.REFRESH_EVERY:
                 return self._field
         elif self._field is not None and self._age % self.RETRY_EVERY:
@@ -258,14 +258,15 @@ class FieldOfViewFinder:
             self._field = found
         return self._field
 
-    def _picture_outside(self, image: npt.NDArray[np.uint8]) -> bool:
-        """Whether a coarse grid of pixels well outside the disc shows picture."""
+    def _misfit(self, image: npt.NDArray[np.uint8]) -> bool:
+        """Whether a coarse grid of pixels shows picture well outside the disc, or none along its rim."""
         assert self._field is not None
         step = max(1, min(image.shape[:2]) // 40)
         grid = image[step // 2 :: step, step // 2 :: step].max(axis=2)
         rows, columns = np.mgrid[0 : grid.shape[0], 0 : grid.shape[1]] * step + step // 2
-        outside = (
-            np.hypot(columns - self._field.centre[0], rows - self._field.centre[1])
-            > 1.05 * self._field.radius
-        )
-        return bool(outside.any() and (grid[outside] > 60).mean() > 0.1)
+        away = np.hypot(columns - self._field.centre[0], rows - self._field.centre[1]) / self._field.radius
+        outside, rim = away > 1.05, (away > 0.8) & (away < 0.97)
+        if outside.any() and (grid[outside] > 60).mean() > 0.1:
+            return True
+        # A gap crosses the rim in two places and leaves most of it lit.
+        return bool(rim.any() and (grid[rim] < 16).mean() > 0.6)

@@ -11,10 +11,12 @@ Mask = npt.NDArray[np.bool_]
 
 # Logistic regression on sections of simulated knees (levels 0-3, open and closed joints) and of real frames
 # with a cleft (a nose) and without one (a laparoscope's), open and closed weighted alike.
-CONTRAST_WEIGHT = 13.9
-SIZE_WEIGHT = 15.2
-UNEVENNESS_WEIGHT = -10.0
-OFFSET = -4.6
+CONTRAST_WEIGHT = 13.7
+SHARPNESS_WEIGHT = 14.1
+SIZE_WEIGHT = 3.3
+UNEVENNESS_WEIGHT = -14.2
+OFFSET = -6.5
+LEAST_CONTRAST = -0.5  # [-]: what is brighter than its sides by more tells nothing more
 LARGEST_SIZE = 0.3  # [-] radius of the disc against the field's, above which more tells nothing more
 LEVEL_OFFSET = 5.0  # [grey levels]: the noise of black is no unevenness
 
@@ -22,12 +24,13 @@ LEVEL_OFFSET = 5.0  # [grey levels]: the noise of black is no unevenness
 def gap_confidence(section: Section, field_radius: float, image: Image, dark: Mask) -> float:
     """Confidence [0, 1] that a section through dark pixels (h, w) of an image (h, w, 3) is a gap.
 
-    A gap is dark against the tissue on both sides, open and evenly dark. Shaded tissue is a little darker
-    than its surroundings, ragged, so that no large disc fits into it, and uneven. `field_radius` [px] is in
-    the pixels of the section.
+    A gap is dark against the tissue on both sides, ends sharply, is open and evenly dark. Shaded tissue is a
+    little darker than its surroundings, ends slowly, is ragged, so that no large disc fits into it, and uneven.
+    `field_radius` [px] is in the pixels of the section.
     """
     evidence = (
-        CONTRAST_WEIGHT * float(section.contrast.min())
+        CONTRAST_WEIGHT * max(float(section.contrast.min()), LEAST_CONTRAST)
+        + SHARPNESS_WEIGHT * float(section.sharpness.min())
         + SIZE_WEIGHT * min(section.radius / field_radius, LARGEST_SIZE)
         + UNEVENNESS_WEIGHT * unevenness(image, dark)
         + OFFSET

@@ -15,6 +15,7 @@ from knee_gap_perception.poses import LensPose
 Array = npt.NDArray[np.float64]
 
 POSES = 3  # through which the motion is drawn
+KEPT = 512  # poses: half a second of the fastest tracker, longer than an image is on its way
 LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion
 LONGEST_AHEAD_NS = 40_000_000  # beyond the last pose
 ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
@@ -25,7 +26,7 @@ class LensPosePredictor:
     """Takes lens poses in the order of their stamps and tells the pose at a stamp near the last of them."""
 
     def __init__(self) -> None:
-        self._poses: deque[LensPose] = deque(maxlen=8 * POSES)
+        self._poses: deque[LensPose] = deque(maxlen=KEPT)
 
     def add(self, pose: LensPose) -> None:
         """Take the next pose; one of another frame, or from before the last, starts anew."""
@@ -34,6 +35,12 @@ class LensPosePredictor:
             if pose.frame_id != last.frame_id or pose.stamp_ns <= last.stamp_ns:
                 self._poses.clear()
         self._poses.append(pose)
+
+    def expects_after(self, stamp_ns: int) -> bool:
+        """Whether a pose that follows a stamp [ns] is still to come, from a tracker that has not fallen silent."""
+        if not self._poses:
+            return False
+        return 0 < stamp_ns - self._poses[-1].stamp_ns <= LONGEST_AHEAD_NS
 
     def at(self, stamp_ns: int) -> LensPose | None:
         """The pose at a stamp [ns] with its covariance; None where no poses are close enough."""
@@ -63,12 +70,16 @@ class LensPosePredictor:
 
     def _motion(self, stamp_ns: int) -> list[LensPose]:
         """The poses that describe the motion around a stamp, up to the first that follows it."""
-        motion: list[LensPose] = []
-        for pose in self._poses:
-            if motion and pose.stamp_ns - motion[-1].stamp_ns > LONGEST_STEP_NS:
-                motion = []
-            if motion and motion[-1].stamp_ns >= stamp_ns:
-                break
-            motion.append(pose)
+        end = len(self._poses)
+        while end > 1 and self._poses[end - 2].stamp_ns >= stamp_ns:
+            end -= 1
+        if end == 0:
+            return []
         # Between two poses those two tell most; beyond the last, more of them level the noise.
-        return motion[-2:] if motion and motion[-1].stamp_ns >= stamp_ns else motion[-POSES:]
+        wanted = 2 if self._poses[end - 1].stamp_ns >= stamp_ns else POSES
+        motion = [self._poses[end - 1]]
+        for index in range(end - 2, max(end - 1 - wanted, -1), -1):
+            if motion[0].stamp_ns - self._poses[index].stamp_ns > LONGEST_STEP_NS:
+                break
+            motion.insert(0, self._poses[index])
+        return motion

@@ -139,8 +139,10 @@ def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
         bearing.x, bearing.y, bearing.z = (float(value) for value in edges.bearings[index])
         setattr(message, f"pixel_{index}", np.array(edges.pixels[index], dtype=np.float64))
         setattr(message, f"kind_{index}", int(edges.kinds[index]))
+        setattr(message, f"hidden_{index}", bool(edges.hidden[index]))
         setattr(
             message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
         )
+    message.pose_used = bool(edges.pose_used)
     message.angular_error = float(edges.angular_error)
     return message

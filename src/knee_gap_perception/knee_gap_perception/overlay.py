@@ -65,6 +65,8 @@ def _draw_point(drawn: Image, edges: GapEdges, index: int, camera: Camera | None
             _draw_ellipse(drawn, centre, covariance, colour, unit)
     kind = edges.kinds[index]
     name = f"G{index}" if kind is EdgeKind.UNKNOWN else f"G{index} {kind.name.lower()}"
+    if edges.hidden[index]:
+        name += ", hidden"
     _write(drawn, name, (centre[0] + round(12 * unit), centre[1] - round(8 * unit)), colour, unit)
 
 

@@ -16,6 +16,10 @@ DIRECTIONS = 36  # across the gap, over half a turn
 STEP = 0.5  # [px at working size] between the samples of a ray
 TISSUE_BEYOND = 6  # [px at working size] of tissue that must follow an edge
 CANDIDATES = 4  # dark parts looked at, largest first
+AROUND = 10  # [px at working size] to either side of an edge in which its sharpness is judged
+LINES = np.linspace(-6.0, 6.0, 7)  # [px at working size] along the edge, on which it is judged
+SHARP = 3  # [px at working size] over which a sharp edge rises
+LEAST_RANGE = 4.0  # [grey levels]: noise is no edge
 
 
 @dataclass(frozen=True)
@@ -23,8 +27,8 @@ class Section:
     """The largest inscribed disc (centre [px], radius [px]) and the two edges across it (2, 2) [px].
 
     `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,)
-    the step over each edge against the tissue's; `solidity` the area of the disc against that of its dark
-    part, up to 1 for a round one: shaded tissue is ragged. Lengths are in pixels of the full image.
+    the step over each edge against the tissue's; `sharpness` (2,) the share of the rise around each edge that
+    falls within a few pixels: shade ends slowly. Lengths are in pixels of the full image.
     """
 
     centre: Array
@@ -32,7 +36,7 @@ class Section:
     edges: Array
     contrast: Array
     levels: Array
-    solidity: float
+    sharpness: Array
 
     @property
     def across(self) -> Array:
@@ -122,8 +126,25 @@ def _section_through(
         edges=(ends + 0.5) / scale - 0.5,
         contrast=contrast,
         levels=levels,
-        solidity=float(np.pi * radius**2 / max(part.sum(), 1)),
+        sharpness=_sharpness(centre, ends, value),
     )
+
+
+def _sharpness(centre: Array, ends: Array, value: Image) -> Array:
+    """Largest rise outwards over SHARP pixels against the range around each end (2, 2): median of lines (2,)."""
+    smooth = cv2.GaussianBlur(value, (0, 0), 1.0).astype(np.float32)
+    outward = (ends - centre) / np.linalg.norm(ends - centre, axis=1, keepdims=True)
+    along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
+    steps = np.arange(-AROUND, AROUND + 1)
+    places = (
+        ends[:, None, None]
+        + LINES[:, None, None] * along[:, None, None]
+        + steps[:, None] * outward[:, None, None]
+    ).astype(np.float32)
+    flat = places.reshape(-1, len(steps), 2)
+    lines = cv2.remap(smooth, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(2, len(LINES), -1)
+    rise = (lines[..., SHARP:] - lines[..., :-SHARP]).max(axis=-1)
+    return np.asarray(np.median(rise / np.maximum(np.ptp(lines, axis=-1), LEAST_RANGE), axis=-1))
 
 
 def _levels(centre: Array, radius: float, ends: Array, value: Image) -> Array:

@@ -4,17 +4,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import Trigger
 
 from knee_gap_msgs.msg import GapEdges
-from knee_gap_node.base_node import IMAGE_QOS, RESULT_QOS, BaseNode, run
+from knee_gap_msgs.srv import ChoosePoint
+from knee_gap_node.base_node import IMAGE_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.segmentation_parameters import TransportParameters
+from knee_gap_perception.segmentation_parameters import PoseParameters, TransportParameters
 from knee_gap_perception.warm_up import warm_up
 
 
@@ -24,7 +26,8 @@ class SegmentationNode(BaseNode):
     def __init__(self) -> None:
         super().__init__("segmentation_node", health=self.health)
         transport = self.declare(TransportParameters).image_transport
-        self._stream = EdgeStream(self.declare(EdgeParameters))
+        poses = self.declare(PoseParameters)
+        self._stream = EdgeStream(self.declare(EdgeParameters), poses)
         self.refuse_unknown_parameters()
         # Compiled before the first image, so that its answer is not late.
         warm_up()
@@ -39,36 +42,75 @@ class SegmentationNode(BaseNode):
         }[transport]
         self.create_subscription(CameraInfo, "camera_info", self._stream.on_camera_info, IMAGE_QOS)
         self.create_subscription(PointStamped, "clicked_point", self.on_click, RESULT_QOS)
+        self.create_service(ChoosePoint, "choose_point", self.on_choose)
+        self.create_service(Trigger, "start_anew", self.on_start_anew)
+        self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, TRACKER_QOS)
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
+        # Runs while an image waits for its pose, so that it does not wait longer than it may.
+        self._patience = self.create_timer(max(poses.max_pose_wait, 0.001), self.publish_ready)
+        self._patience.cancel()
 
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
-        """Publish the edges in an image, and the pictures that anybody wants."""
+        """Take an image; it is looked at now, or once the pose that follows it is there."""
         self.count_dropped(info.get("publication_sequence_number"))
-        edges = self._stream.on_image(message)
-        self._edges.publish(fill_gap_edges(GapEdges(), edges))
-        if self._stream.reason:
-            self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
-        if self._mask.get_subscription_count():
-            self.publish_picture(self._mask, self._stream.detector.gap_mask(), "mono8", message)
-        if self._overlay.get_subscription_count():
-            overlay = self._stream.overlay()
-            if overlay is not None:
-                self.publish_picture(self._overlay, overlay, "bgr8", message)
+        self._stream.on_image(message, self.now_ns())
+        self.publish_ready()
+
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Take a pose of the lens, which an image may have waited for."""
+        self._stream.on_lens_pose(message)
+        self.publish_ready()
+
+    def publish_ready(self) -> None:
+        """Publish the edges in the images that wait no longer, and the pictures that anybody wants."""
+        for edges in self._stream.ready(self.now_ns()):
+            message = fill_gap_edges(GapEdges(), edges)
+            self._edges.publish(message)
+            if self._stream.reason:
+                self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
+            if self._mask.get_subscription_count():
+                self.publish_picture(self._mask, self._stream.detector.gap_mask(), "mono8", message)
+            if self._overlay.get_subscription_count():
+                overlay = self._stream.overlay()
+                if overlay is not None:
+                    self.publish_picture(self._overlay, overlay, "bgr8", message)
+        if not self._stream.waiting:
+            self._patience.cancel()
+        elif self._patience.is_canceled():
+            self._patience.reset()
+
+    def now_ns(self) -> int:
+        """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""
+        return int(self.get_clock().now().nanoseconds)
 
     def on_click(self, message: PointStamped) -> None:
         """Choose the section of the gap nearest to a pixel (x column, y row) of the next image."""
-        self._stream.detector.choose_at(np.array([message.point.x, message.point.y]))
+        clicked = np.array([message.point.x, message.point.y])
+        if np.isfinite(clicked).all():
+            self._stream.detector.choose_at(clicked)
+
+    def on_choose(self, request: ChoosePoint.Request, answer: ChoosePoint.Response) -> ChoosePoint.Response:
+        """Choose the section nearest to a pixel, if the latest image shows a gap there."""
+        answer.reason = self._stream.choose(request.column, request.row)
+        answer.accepted = not answer.reason
+        return answer
+
+    def on_start_anew(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        """End the track; the next image that shows a gap begins a new one."""
+        self._stream.detector.end_track()
+        answer.success, answer.message = True, "the next image that shows a gap begins a new track"
+        return answer
 
     def publish_picture(
         self,
         publisher: Publisher,
         picture: npt.NDArray[np.uint8],
         encoding: str,
-        image: Image | CompressedImage,
+        edges: GapEdges,
     ) -> None:
-        """Publish what was made of an image, with that image's header."""
+        """Publish what was made of an image, with the header of its edges, which is the image's."""
         message = Image(
-            header=image.header, height=picture.shape[0], width=picture.shape[1], encoding=encoding
+            header=edges.header, height=picture.shape[0], width=picture.shape[1], encoding=encoding
         )
         message.step = picture.strides[0]
         message.data = picture.tobytes()

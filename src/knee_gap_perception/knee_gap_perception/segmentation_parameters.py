@@ -1,4 +1,4 @@
-"""Parameters of segmentation_node that are not of its core: how images reach it."""
+"""Parameters of segmentation_node beside those of the edges: how images and lens poses reach it."""
 
 from dataclasses import dataclass, field
 
@@ -14,6 +14,22 @@ class TransportParameters:
         metadata={
             "description": "raw subscribes to image_raw, compressed to image_raw/compressed",
             "choices": ("raw", "compressed"),
+        },
+    )
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+
+@dataclass(frozen=True)
+class PoseParameters:
+    """How the pose of the lens is waited for. Raises PerceptionError for values outside their range."""
+
+    max_pose_wait: float = field(
+        default=0.03,
+        metadata={
+            "description": "How long an image waits for the lens pose after it; 0: not at all [s]",
+            "range": (0.0, 0.1),
         },
     )
 

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
+from knee_gap_perception.edges import GapEdges
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_lens_pose
 from knee_gap_perception.optitrack.body_source import choose_body
@@ -16,6 +17,7 @@ from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.scope_feed import SCOPE, SourceParameters
 from knee_gap_perception.pose_validity import ValidityParameters
 from knee_gap_perception.poses import LensPose
+from knee_gap_perception.segmentation_parameters import PoseParameters
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_replay.parameters_file import ParametersFile
 from knee_gap_replay.processing import Output
@@ -33,18 +35,23 @@ _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
-    "segmentation_node": (EdgeParameters,),
+    "segmentation_node": (EdgeParameters, PoseParameters),
     "tracking_node": (TrackingParameters, ValidityParameters, SourceParameters, NatNetParameters),
     "uncertainty_node": (EstimatorParameters, AdviceParameters),
 }
 
 
 class GapPipeline:
-    """Feeds the cores in the order of stamps; `space` is the namespace of what it publishes."""
+    """Feeds the cores in the order of stamps; `space` is the namespace of what it publishes.
+
+    `with_mask` publishes the mask of the gap in every image as well, which the node makes for listeners only.
+    """
 
     @classmethod
-    def from_parameters(cls, file: ParametersFile, topics: InputTopics, space: str) -> Self:
-        """Return a pipeline of cores with the parameters of the nodes in `file`.
+    def from_parameters(
+        cls, file: ParametersFile, topics: InputTopics, space: str, *, with_mask: bool = False
+    ) -> Self:
+        """Return a pipeline of cores with the parameters of the nodes in `file`; `with_mask` as in GapPipeline.
 
         Raises BagError for parameters that no core has or that one refuses.
         """
@@ -58,6 +65,7 @@ class GapPipeline:
             topics,
             space,
             up_axis=source.resolved_up_axis(),
+            with_mask=with_mask,
         )
 
     def __init__(
@@ -69,6 +77,7 @@ class GapPipeline:
         space: str,
         *,
         up_axis: str = "z",
+        with_mask: bool = False,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
@@ -81,6 +90,7 @@ class GapPipeline:
         self._estimator = estimator
         self._topics = topics
         self._space = space
+        self._with_mask = with_mask
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still where they run backwards.
         self._now_ns = 0
@@ -93,12 +103,16 @@ class GapPipeline:
             self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
             **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
         }
+        if with_mask:
+            self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
         """Take an image, a camera model or a pose of the tracked body; return what is published then."""
         if self._newest_stamp_ns is not None:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
         self._newest_stamp_ns = stamp_ns
+        # Before the message is taken: what it could not wait for any longer is without it, as live.
+        yield from self._looked_at(self._detector.ready(self._now_ns))
         yield from self._published(self._estimator.advance(self._now_ns))
         yield from self._advice()
         if topic == self._topics.camera_info:
@@ -106,10 +120,12 @@ class GapPipeline:
         elif topic in self._body_names:
             yield from self._on_body_pose(self._body_names[topic], message)
         else:
-            yield from self._on_image(message)
+            self._detector.on_image(message, self._now_ns)
+        yield from self._looked_at(self._detector.ready(self._now_ns))
 
     def finish(self) -> Iterable[Output]:
-        """Return the estimates of images whose lens pose will not come any more."""
+        """Return the edges and estimates of images whose lens pose will not come any more."""
+        yield from self._looked_at(self._detector.finish())
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
         yield from self._published(self._estimator.advance(self._now_ns + wait_ns + 1))
 
@@ -124,13 +140,24 @@ class GapPipeline:
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
             estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
             yield from self._published(estimates)
+            self._detector.on_lens_pose(pose)
 
-    def _on_image(self, message: Any) -> Iterator[Output]:
-        edges = self._detector.on_image(message)
-        edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
-        yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
-        observation = messages.edges_from_message(edges_message)
-        yield from self._published(self._estimator.add_edges(observation, self._now_ns))
+    def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output]:
+        for edges in images:
+            edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+            yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
+            if self._with_mask:
+                yield Output(self._topic("gap_mask"), self._mask_message(edges), edges.stamp_ns)
+            observation = messages.edges_from_message(edges_message)
+            yield from self._published(self._estimator.add_edges(observation, self._now_ns))
+
+    def _mask_message(self, edges: GapEdges) -> Any:
+        message, mask = blank("sensor_msgs/msg/Image"), self._detector.detector.gap_mask()
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(edges.stamp_ns, NANOSECONDS)
+        message.header.frame_id, message.encoding = edges.frame_id, "mono8"
+        message.height, message.width = mask.shape
+        message.step, message.data = mask.shape[1], mask.ravel()
+        return message
 
     def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
         for estimate in estimates:

@@ -31,7 +31,9 @@ def _run(arguments: argparse.Namespace) -> int:
     with BagReader(arguments.bag) as reader:
         parameters = ParametersFile(_parameters_path(arguments))
         topics = topics_from(arguments, reader.topics)
-        pipeline = GapPipeline.from_parameters(parameters, topics, namespace_from(arguments))
+        pipeline = GapPipeline.from_parameters(
+            parameters, topics, namespace_from(arguments), with_mask=arguments.gap_mask
+        )
         reader.messages(pipeline.inputs)  # refuses a bag without them before anything is written
         with BagWriter(arguments.out, metadata=reader.metadata) as writer:
             counts = process(reader, writer, pipeline)
@@ -48,6 +50,9 @@ def _parser() -> Parser:
         "--params-file",
         metavar="YAML",
         help=f"ROS parameters of the nodes; default {_BESIDE} in the bag",
+    )
+    parser.add_argument(
+        "--gap-mask", action="store_true", help="write the mask of the gap in every image as well (gap_mask)"
     )
     add_topic_arguments(parser)
     return parser

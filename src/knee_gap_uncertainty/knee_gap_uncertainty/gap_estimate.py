@@ -30,7 +30,9 @@ class EdgeObservation:
     `stamp_ns` is the exposure time [ns]; `bearings` (2, 3) unit vectors in the lens frame; `covariances`
     (2, 3, 3) of the unit vectors [rad^2]; `angular_error` bounds each bearing's angle to the truth [rad].
     `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code,
-    `frame_id` the lens frame.
+    `frame_id` the lens frame. `hidden` is true where a bearing is a prediction from earlier images: those have
+    been counted, and counting them again would make the fit too sure. `pose_used` says that the pose of the
+    lens guided the search, so that bearings and pose share some of their errors.
     """
 
     stamp_ns: int
@@ -41,11 +43,15 @@ class EdgeObservation:
     angular_error: float
     status: int = 0
     frame_id: str = "arthroscope_optical"
+    hidden: bool = False
+    pose_used: bool = False
 
     def flaw(self) -> str:
         """Why the observation cannot be used, in words; empty if it can."""
         if not self.usable:
             return f"the image gave no usable edges (edge status {self.status})"
+        if self.hidden:
+            return "a point is hidden in the image: its bearing is a prediction, not a measurement"
         if not (np.isfinite(self.bearings).all() and np.isfinite(self.covariances).all()):
             return "the edges say valid and carry numbers that are not finite"
         if np.abs(np.linalg.norm(self.bearings, axis=1) - 1.0).max() > UNIT_TOLERANCE:

@@ -30,6 +30,8 @@ def edges_from_message(message: Any) -> EdgeObservation:
         angular_error=float(message.angular_error),
         status=int(message.status),
         frame_id=str(message.header.frame_id),
+        hidden=bool(message.hidden_0) or bool(message.hidden_1),
+        pose_used=bool(message.pose_used),
     )
 
 

@@ -132,6 +132,23 @@ def test_a_point_that_leaves_the_field_is_told(joint: Any, travel: Travel) -> No
     assert "left the field" in detector.reason
 
 
+def test_a_lamp_that_flickers_is_told_and_does_not_end_the_track(joint: Any, travel: Travel) -> None:
+    detector = GapEdgeDetector()
+    assert detector.process(0, travel[1][0], joint.camera).track_id == 1
+    for k, (level, reason) in enumerate([(0, "dark"), (255, "overexposed")]):
+        dark = np.full_like(travel[1][0], level)
+        edges = detector.process((k + 1) * FRAME_NS, dark, joint.camera)
+        assert (edges.status, edges.track_id) == (EdgeStatus.LOW_CONTRAST, 1)
+        assert reason in detector.reason
+        assert np.isnan(edges.bearings).all()
+    again = detector.process(3 * FRAME_NS, travel[1][1], joint.camera)
+    assert (again.status, again.track_id) == (EdgeStatus.VALID, 1)
+    for k in range(4, 30):
+        dark = np.full_like(travel[1][0], k % 2)
+        assert detector.process(k * FRAME_NS, dark, joint.camera).status is EdgeStatus.LOW_CONTRAST
+    assert detector.process(30 * FRAME_NS, travel[1][1], joint.camera).track_id == 2
+
+
 def test_stamps_running_backwards_start_a_new_track(joint: Any, travel: Travel) -> None:
     detector = GapEdgeDetector()
     assert detector.process(10 * FRAME_NS, travel[1][0], joint.camera).track_id == 1

@@ -95,13 +95,17 @@ def test_stream_keeps_the_disc_through_dark_images_and_finds_a_new_one_for_a_new
     assert smaller.radius == pytest.approx(200, abs=3)
 
 
-def test_a_disc_that_grows_is_found_anew() -> None:
+@pytest.mark.parametrize(
+    ("centre", "radius"), [((640, 360), 350), ((640, 360), 180), ((340, 530), 180)], ids=str
+)
+def test_a_disc_that_grows_shrinks_or_moves_is_found_anew(centre: tuple[int, int], radius: int) -> None:
     finder = FieldOfViewFinder()
-    finder.find(disc((1280, 720), (640, 360), 220))
+    finder.find(disc((1280, 720), (640, 360), 230 if radius == 350 else 340))
     for _ in range(finder.CHECK_EVERY * (finder.MISFITS + 1)):
-        field = finder.find(disc((1280, 720), (640, 360), 350))
+        field = finder.find(disc((1280, 720), centre, radius))
     assert field is not None
-    assert field.radius == pytest.approx(350, abs=4)
+    assert field.radius == pytest.approx(radius, abs=4)
+    np.testing.assert_allclose(field.centre, centre, atol=3)
 
 
 def test_real_rigid_endoscope(real_images: Callable[[str], list[Path]]) -> None:

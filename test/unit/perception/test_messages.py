@@ -133,6 +133,8 @@ def test_edges_fill_every_field_of_the_message() -> None:
         kinds=(EdgeKind.RIM, EdgeKind.CONTOUR),
         covariances=covariances,
         angular_error=0.01,
+        hidden=(False, True),
+        pose_used=True,
     )
     filled = fill_gap_edges(blank_edges(), edges)
     assert stamp_ns(filled.header) == edges.stamp_ns
@@ -142,6 +144,7 @@ def test_edges_fill_every_field_of_the_message() -> None:
     np.testing.assert_array_equal(filled.pixel_1, [3.0, 4.0])
     assert (filled.kind_0, filled.kind_1) == (1, 2)
     np.testing.assert_array_equal(filled.covariance_1, np.arange(9.0, 18.0))
+    assert (filled.hidden_0, filled.hidden_1, filled.pose_used) == (False, True, True)
     assert filled.angular_error == 0.01
 
 

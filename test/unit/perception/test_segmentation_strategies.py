@@ -11,7 +11,8 @@ import pytest
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 from knee_gap_perception.segmentation.network import Network
-from knee_gap_perception.segmentation.thresholds import otsu3_threshold, otsu_threshold
+from knee_gap_perception.segmentation.three_classes import otsu3
+from knee_gap_perception.segmentation.thresholds import otsu_threshold
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -61,10 +62,30 @@ def test_otsu_parts_two_and_three_groups() -> None:
         np.clip(rng.normal(mean, 5, 4000), 0, 255).astype(np.uint8) for mean in (20, 110, 210)
     )
     assert 35 < otsu_threshold(np.concatenate([low, high])) < 195
-    assert 35 < otsu3_threshold(np.concatenate([low, middle, high])) < 95
-    assert otsu3_threshold(np.repeat(np.array([10, 200], np.uint8), 50)) == otsu_threshold(
-        np.repeat(np.array([10, 200], np.uint8), 50)
-    )
+    dark, between, clearness = otsu3(np.concatenate([low, middle, high]))
+    assert 35 < dark < 95
+    assert 125 < between < 195
+    assert 0.98 < clearness < 1.0
+    assert otsu3(np.repeat(np.array([10, 200], np.uint8), 50)).dark == 10
+    assert otsu3(np.full(9, 7, np.uint8)) == (7, 7, 0)
+    even = rng.integers(0, 256, 4000).astype(np.uint8)
+    assert otsu3(even).clearness < clearness
+
+
+def test_light_that_falls_to_the_rim_is_evened(drawn: tuple[Image, Mask, Mask]) -> None:
+    """A veiled gap whose middle is as bright as the tissue at the rim: no threshold parts them as they are."""
+    _, field, gap = drawn
+    rows, columns = np.mgrid[0:180, 0:320].astype(float)
+    lit = np.where(gap, 75.0, 150.0) * np.exp(-0.9 * ((rows - 90) ** 2 + (columns - 160) ** 2) / 86**2)
+    noise = np.random.default_rng(6).normal(0, 2, (180, 320, 3))
+    image = np.clip(lit[..., None] + noise, 0, 255).astype(np.uint8)
+    dice = {}
+    for name in ("otsu", "otsu3", "watershed"):
+        dark = segmentation_named(name)(image, field)
+        dice[name] = 2 * (dark & gap).sum() / (dark.sum() + gap.sum())
+    assert dice["otsu"] < 0.8
+    assert dice["otsu3"] > 0.95
+    assert dice["watershed"] > 0.95
 
 
 def test_unknown_names_are_refused_with_the_choices() -> None:

@@ -1,5 +1,6 @@
 """The pipeline of a bag: the tracked body and the edges of two known points give their known distance."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast
 
@@ -41,11 +42,26 @@ class TrueEdges:
 
     def __init__(self) -> None:
         self.camera_seen = False
+        self.images: list[Any] = []
+        self.pose_stamps: list[int] = []
 
     def on_camera_info(self, message: Any) -> None:
         self.camera_seen = True
 
-    def on_image(self, message: Any) -> GapEdges:
+    def on_lens_pose(self, message: Any) -> None:
+        self.pose_stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+    def on_image(self, message: Any, now_ns: int) -> None:
+        self.images.append(message)
+
+    def ready(self, now_ns: int) -> Iterator[GapEdges]:
+        while self.images:
+            yield self.look(self.images.pop(0))
+
+    def finish(self) -> Iterator[GapEdges]:
+        return self.ready(0)
+
+    def look(self, message: Any) -> GapEdges:
         assert self.camera_seen
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         T = lens_pose(stamp_ns)

@@ -3,8 +3,8 @@
 import numpy as np
 from skimage.segmentation import morphological_chan_vese
 
+from knee_gap_perception.segmentation.even_light import even_light
 from knee_gap_perception.segmentation.strategy import Image, Mask
-from knee_gap_perception.segmentation.thresholds import log_brightness, otsu3_threshold
 
 
 class ChanVese:
@@ -18,12 +18,13 @@ class ChanVese:
         """Dark pixels (h, w) of an image (h, w, 3) within `field` (h, w)."""
         if not field.any():
             return field.copy()
-        value = log_brightness(image)
-        start = field & (value <= otsu3_threshold(value[field]))
+        evened, dark, _ = even_light(image, field)
+        start = field & (evened <= dark)
         # Lit tissue spans several times the range of the gap; levelling it leaves two even parts. Outside the
         # field the level is that of lit tissue, so that no contour forms on the rim.
-        level = np.minimum(value, np.percentile(value[field], 50)).astype(np.float64)
-        level[~field] = np.percentile(value[field], 50)
+        lit = float(np.percentile(evened[field], 50))
+        level = np.minimum(evened, lit).astype(np.float64)
+        level[~field] = lit
         grown = morphological_chan_vese(  # type: ignore[no-untyped-call]
             level, self._iterations, init_level_set=start.astype(np.int8), smoothing=self._smoothing
         )

@@ -4,34 +4,37 @@ import cv2
 import numpy as np
 from skimage.segmentation import watershed
 
+from knee_gap_perception.segmentation.even_light import even_light, log_levels
 from knee_gap_perception.segmentation.strategy import Image, Mask
-from knee_gap_perception.segmentation.thresholds import log_brightness, otsu3_threshold
 
 GAP, TISSUE = 1, 2
 
 
 class Watershed:
-    """Floods the gradient of the logarithm of brightness from what is surely gap and what is surely tissue.
+    """Floods the gradient of brightness from what is surely gap and what is surely tissue.
 
-    Sure is what lies clear of the lower of three classes' thresholds; between, the border is where
-    brightness changes fastest, whatever its level there: a veil of fluid or a shaded flank shifts the
-    level, not the step.
+    Sure is what lies clear of the threshold between the dark and the middle of three classes, tissue only from
+    well within the middle class on: shaded bone behind a rim belongs to the gap, and the step at the rim is
+    higher than the one behind it. Between, the border is where brightness changes fastest, whatever its level
+    there: a veil of fluid or a shaded flank shifts the level, not the step.
     """
 
-    MARGIN = (
-        12.0  # [grey levels of the logarithm] on either side of the threshold, within which nothing is sure
-    )
+    MARGIN = 24.0  # [levels of the logarithm] on either side of the threshold, within which nothing is sure
+    SURE_TISSUE = 0.6  # [-] of the middle class, below which nothing is sure
+    GRADIENT_OFFSET = 64.0  # [grey levels]: steps count by brightness more than by its logarithm
 
     def __call__(self, image: Image, field: Mask) -> Mask:
         """Dark pixels (h, w) of an image (h, w, 3) within `field` (h, w)."""
         if not field.any():
             return field.copy()
-        value = log_brightness(np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8))
-        threshold = otsu3_threshold(value[field])
-        smooth = value.astype(np.float32)
-        gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+        smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8)
+        level, dark, middle = even_light(smooth, field)
+        steps = log_levels(smooth, self.GRADIENT_OFFSET)
+        gradient = np.hypot(cv2.Sobel(steps, cv2.CV_32F, 1, 0), cv2.Sobel(steps, cv2.CV_32F, 0, 1))
+        # Half of the dark class is sure in any case: it may be narrower than the margin.
+        sure_gap = max(dark - self.MARGIN, float(np.median(level[field & (level <= dark)])))
         markers = np.zeros(field.shape, np.int32)
-        markers[field & (value < threshold - self.MARGIN)] = GAP
-        markers[field & (value > threshold + self.MARGIN)] = TISSUE
+        markers[field & (level <= sure_gap)] = GAP
+        markers[field & (level > dark + max(self.MARGIN, self.SURE_TISSUE * (middle - dark)))] = TISSUE
         flooded = watershed(gradient, markers, mask=field)  # type: ignore[no-untyped-call]
         return np.asarray(flooded == GAP)

@@ -1,0 +1,181 @@
+"""Segmentation and the decision for a gap, on simulated knees and on real frames that show no gap.
+
+Dice is told inside the field disc, mean and 10th percentile over frames, for every strategy at the working
+size and, to show what that costs, at full size. A false gap is a frame of a closed joint, or a real frame
+without a cleft, in which points were chosen. The reliability table says of the sections found in open and in
+closed joints, weighted alike, how many are gaps at each confidence.
+"""
+
+import argparse
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from knee_gap_perception.camera import Camera, FisheyeCamera
+from knee_gap_perception.edge_detector import GapEdgeDetector
+from knee_gap_perception.edge_parameters import EdgeParameters
+from knee_gap_perception.edges import EdgeStatus
+from knee_gap_simulation.bench import FROM_SEED, Bench, BenchFrame
+from knee_gap_simulation.errors import SimulationError
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese")
+NEEDED = (0.97, 0.96, 0.94, 0.88)
+BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+SHADES = ((1.0, 0.0), (0.5, 0.0), (0.5, 0.7), (0.25, 0.7))  # gain, and how much of it is lost at the rim
+
+
+class Judged(NamedTuple):
+    """What was decided of a frame: the confidence of the best section (NaN without one), and two truths."""
+
+    confidence: float
+    is_gap: bool
+    found: bool
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Score the levels, directions, seeds and strategies asked for."""
+    parser = argparse.ArgumentParser(prog="bench_segmentation", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--seed", type=int, nargs="+", default=[301, 302, 303])
+    parser.add_argument("--level", type=int, nargs="+", default=[0, 1, 2, 3])
+    parser.add_argument("--travel-direction", nargs="+", default=["along"])
+    parser.add_argument("--frames", type=int, default=3, help="of every seed, over its travel")
+    parser.add_argument("--strategy", nargs="+", choices=STRATEGIES, default=["otsu", "otsu3", "watershed"])
+    parser.add_argument("--full-size", action="store_true", help="the first strategy at full size as well")
+    parser.add_argument("--no-gap", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument(
+        "--real", type=Path, nargs="*", default=[], help="real frames without a cleft: folders or videos"
+    )
+    asked = parser.parse_args(argv)
+    judged: list[Judged] = []
+    for level in asked.level:
+        scores: dict[str, list[float]] = defaultdict(list)
+        opened: list[Judged] = []
+        for frame, camera in rendered(level, asked, is_open=True):
+            for name in asked.strategy:
+                scores[name].append(dice_of(frame, camera, EdgeParameters(segmentation=name)))
+            if asked.full_size:
+                full = EdgeParameters(segmentation=asked.strategy[0], working_rows=720)
+                scores[f"{asked.strategy[0]} at 720 rows"].append(dice_of(frame, camera, full))
+            opened.append(judge(frame, camera))
+        for name, values in scores.items():
+            print(
+                f"level {level}  {name:20s} Dice {np.mean(values):.4f}  p10 {np.percentile(values, 10):.3f}  "
+                f"worst {min(values):.3f}  needed {NEEDED[level]:.2f}  {len(values)} frames",
+                flush=True,
+            )
+        print(f"level {level}  gap found in {share(opened):.1%} of {len(opened)} frames with one", flush=True)
+        judged += opened
+        if asked.no_gap:
+            closed = [judge(frame, camera) for frame, camera in rendered(level, asked, is_open=False)]
+            print(f"level {level}  false gap in {share(closed):.1%} of {len(closed)} closed joints", flush=True)
+            judged += closed
+    for path in asked.real:
+        frames = [judge_real(picture) for picture in pictures(path)]
+        print(f"{path.name}: false gap in {share(frames):.1%} of {len(frames)} frames")
+    print_reliability(judged)
+    return 0
+
+
+def rendered(
+    level: int, asked: argparse.Namespace, *, is_open: bool
+) -> Iterator[tuple[BenchFrame, Camera]]:
+    """Frames of every seed and direction, spread over the travel."""
+    jobs = [(direction, seed) for direction in asked.travel_direction for seed in asked.seed]
+    for direction, seed in tqdm(jobs, desc=f"level {level}", disable=not sys.stderr.isatty()):
+        try:
+            bench = Bench(level, seed, direction, gap=FROM_SEED if is_open else None)
+        except SimulationError as error:
+            print(f"bench_segmentation: seed {seed} {direction} left out: {error}", file=sys.stderr)
+            continue
+        lens = bench.lens
+        camera = FisheyeCamera(
+            lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
+        )
+        step = max(1, bench.frame_count // asked.frames)
+        for frame in bench.frames(step // 2, bench.frame_count, step):
+            yield frame, camera
+
+
+def dice_of(frame: BenchFrame, camera: Camera, parameters: EdgeParameters) -> float:
+    """Dice of a frame's mask."""
+    detector = GapEdgeDetector(parameters)
+    detector.process(0, frame.image, camera)
+    mask, truth = detector.gap_mask() > 0, frame.gap_mask
+    return float(2 * (mask & truth).sum() / max(mask.sum() + truth.sum(), 1))
+
+
+def judge(frame: BenchFrame, camera: Camera) -> Judged:
+    """Decide on a frame by itself, and compare with its truth."""
+    confidence, found = decide(frame.image, camera)
+    detector = GapEdgeDetector(replace(EdgeParameters(), minimum_confidence=0.0))
+    edges = detector.process(0, frame.image, camera)
+    middle = np.rint(edges.pixels.mean(axis=0)) if edges.status is EdgeStatus.VALID else None
+    is_gap = middle is not None and bool(frame.gap_mask[int(middle[1]), int(middle[0])])
+    return Judged(confidence, is_gap, found)
+
+
+def decide(image: Image, camera: Camera) -> tuple[float, bool]:
+    """Confidence of the best section of a picture, and whether points were chosen."""
+    detector = GapEdgeDetector()
+    edges = detector.process(0, image, camera)
+    return detector.confidence, edges.status is EdgeStatus.VALID
+
+
+def judge_real(image: Image) -> Judged:
+    """Decide on a real frame without a cleft."""
+    height, width = image.shape[:2]
+    camera = FisheyeCamera(width, height, 0.6 * height, 0.6 * height, width / 2, height / 2)
+    confidence, found = decide(image, camera)
+    return Judged(confidence, False, found)
+
+
+def pictures(path: Path) -> Iterator[Image]:
+    """Every fifth frame of a video, or the pictures of a folder, each as it is and under less and less light."""
+    frames: list[Image] = []
+    if path.is_dir():
+        frames = [np.asarray(cv2.imread(str(file)), np.uint8) for file in sorted(path.glob("*.jpg"))]
+    else:
+        video = cv2.VideoCapture(str(path))
+        while (read := video.read())[0]:
+            frames.append(np.asarray(read[1], np.uint8))
+        frames = frames[::5]
+    for frame in frames:
+        rows, columns = np.ogrid[-1 : 1 : frame.shape[0] * 1j, -1 : 1 : frame.shape[1] * 1j]
+        away = np.minimum(np.hypot(rows, columns), 1.0)[..., None]
+        for gain, fall in SHADES:
+            yield np.asarray(frame * gain * (1.0 - fall * away**2), np.uint8)
+
+
+def share(frames: Sequence[Judged]) -> float:
+    """Share of frames in which points were chosen."""
+    return float(np.mean([frame.found for frame in frames])) if frames else float("nan")
+
+
+def print_reliability(judged: Sequence[Judged]) -> None:
+    """Confidence against the share of true gaps among the sections that have it, open and closed alike."""
+    known = [frame for frame in judged if np.isfinite(frame.confidence)]
+    gaps, others = sum(frame.is_gap for frame in known), sum(not frame.is_gap for frame in known)
+    if not gaps or not others:
+        return
+    print("confidence    sections   gaps among them (gaps and others weighted alike)")
+    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+        inside = [f for f in known if low <= f.confidence < high or (high == 1.0 and f.confidence == 1.0)]
+        right = sum(frame.is_gap for frame in inside) / gaps
+        wrong = sum(not frame.is_gap for frame in inside) / others
+        told = f"{right / (right + wrong):.2f}" if inside else "-"
+        print(f"{low:.1f} to {high:.1f}   {len(inside):8d}   {told:>5s}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
