@@ -1,8 +1,10 @@
 """The edges of the gap on simulated knees whose truth is known, level by level, on seeds of your choice.
 
 A track is scored from its first image on: the surface points behind its first two pixels are its truth.
-Errors are told along and across the edge, in degrees; NEES is the squared error in units of its own
-covariance, against its expectation; held is the share of images with a valid track while both are to be seen.
+Errors are told along and across the edge, in degrees, as the median over tracks of their root mean square;
+NEES is the squared error in units of its own covariance, against its expectation; held is the share of
+images with a valid track while both are to be seen. The gap is what the estimator makes of it with the
+tracked poses: its error, and the shares of valid estimates whose bounds and interval hold the true distance.
 """
 
 import argparse
@@ -18,9 +20,15 @@ from tqdm import tqdm
 from knee_gap_perception.camera import FisheyeCamera, bearing_jacobian
 from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edges import EdgeStatus, GapEdges
+from knee_gap_perception.messages import fill_gap_edges
+from knee_gap_perception.messages_tracking import fill_lens_pose
 from knee_gap_perception.poses import LensPose
+from knee_gap_replay.types import blank
 from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_uncertainty import messages
+from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.gap_estimate import GapStatus
 
 Array = npt.NDArray[np.float64]
 
@@ -31,39 +39,82 @@ ROTATION_ERROR = float(np.radians(0.004) / np.sqrt(3))
 
 @dataclass
 class Scores:
-    """What the images of one track, or of many, add up to."""
+    """What the images of one scope, or of many, add up to.
+
+    `rms` holds one track's root mean square along and across the edge and over all [rad]; `gaps` a valid
+    estimate's error [m], whether the bounds and the interval hold the truth, and the interval's width [m].
+    """
 
     along: list[float] = field(default_factory=list)
     across: list[float] = field(default_factory=list)
+    rms: list[tuple[float, float, float]] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
     covered: list[bool] = field(default_factory=list)
     bound: list[float] = field(default_factory=list)
     dice: list[float] = field(default_factory=list)
     held: list[bool] = field(default_factory=list)
+    gaps: list[tuple[float, bool, bool, float]] = field(default_factory=list)
     tracks: int = 0
 
     def add(self, other: "Scores") -> None:
-        """Take in the images of another track."""
-        for name in ("along", "across", "nees", "covered", "bound", "dice", "held"):
+        """Take in the images of another scope."""
+        for name in ("along", "across", "rms", "nees", "covered", "bound", "dice", "held", "gaps"):
             getattr(self, name).extend(getattr(other, name))
         self.tracks += other.tracks
+
+    def finish(self) -> "Scores":
+        """Sum up the root mean squares, after the last image."""
+        if self.along:
+            along, across = float(np.mean(np.square(self.along))), float(np.mean(np.square(self.across)))
+            self.rms = [(along**0.5, across**0.5, (along + across) ** 0.5)]
+        return self
 
     def line(self) -> str:
         """All of it in one line."""
 
-        def rms(values: list[float]) -> float:
-            return float(np.degrees(np.sqrt(np.mean(np.square(values))))) if values else float("nan")
-
         def mean(values: Sequence[float]) -> float:
             return float(np.mean(values)) if values else float("nan")
 
-        bound = np.degrees(np.median(self.bound)) if self.bound else float("nan")
+        def median(values: Sequence[float]) -> float:
+            return float(np.median(values)) if values else float("nan")
+
+        along, across, both = (np.degrees(median([track[k] for track in self.rms])) for k in range(3))
+        errors = [abs(error) for error, *_ in self.gaps]
         return (
-            f"Dice {mean(self.dice):.3f}  "
-            f"along {rms(self.along):.2f} deg  across {rms(self.across):.2f} deg  "
-            f"bound {bound:.2f} deg holds {100 * mean(self.covered):.1f} %  NEES {mean(self.nees):.2f}  "
-            f"held {100 * mean(self.held):.0f} %  tracks {self.tracks}"
+            f"Dice {mean(self.dice):.3f}  rms {both:.2f} deg (along {along:.2f}, across {across:.2f})  "
+            f"bound {np.degrees(median(self.bound)):.2f} deg holds {100 * mean(self.covered):.1f} %  "
+            f"NEES {mean(self.nees):.2f}  held {100 * mean(self.held):.0f} %  tracks {self.tracks}  |  "
+            f"gap valid {len(self.gaps)}  error {1e3 * median(errors):.3f} mm  "
+            f"in [min, max] {100 * mean([gap[1] for gap in self.gaps]):.1f} %  "
+            f"in the interval {100 * mean([gap[2] for gap in self.gaps]):.1f} %, "
+            f"{1e3 * median([gap[3] for gap in self.gaps]):.2f} mm wide"
         )
+
+
+class GapCheck:
+    """The estimator behind the edges, and the true distance of the points of every track."""
+
+    def __init__(self) -> None:
+        self._estimator = GapEstimator()
+        self._truth: dict[int, float] = {}
+
+    def begin(self, track_id: int, points: Array) -> None:
+        """Note the true points (2, 3) [m] of a track."""
+        self._truth[track_id] = float(np.linalg.norm(points[1] - points[0]))
+
+    def add(self, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
+        """Hand an image's edges and pose to the estimator, as messages, and score what comes out."""
+        posed = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), pose)
+        seen = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+        now = edges.stamp_ns
+        estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
+        estimates += self._estimator.add_edges(messages.edges_from_message(seen), now)
+        for estimate in estimates:
+            truth = self._truth.get(estimate.track_id, np.nan)
+            if estimate.status is GapStatus.VALID and np.isfinite(truth):
+                low, high = estimate.confidence_min, estimate.confidence_max
+                bounded = estimate.gap_min <= truth <= estimate.gap_max
+                scores.gaps.append((estimate.gap - truth, bounded, low <= truth <= high, high - low))
 
 
 def lens_pose(frame: BenchFrame) -> LensPose:
@@ -80,23 +131,26 @@ def score(bench: Bench, *, posed: bool) -> Scores:
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
-    detector, scores, track, points = GapEdgeDetector(), Scores(), 0, None
+    detector, scores, check, track, points = GapEdgeDetector(), Scores(), GapCheck(), 0, None
     for frame in bench.frames():
-        edges = detector.process(frame.stamp_ns, frame.image, camera, lens_pose(frame) if posed else None)
+        pose = lens_pose(frame)
+        edges = detector.process(frame.stamp_ns, frame.image, camera, pose if posed else None)
         if frame.index % 10 == 0:
             scores.dice.append(dice(detector.gap_mask() > 0, frame.gap_mask))
         valid = edges.status is EdgeStatus.VALID
         if valid and edges.track_id != track:
             track, points = edges.track_id, bench.points(frame, edges.pixels)
             scores.tracks += 1
+            check.begin(track, points.points)
+        check.add(pose, edges, scores)
         if points is None:
             continue
-        sightings = bench.follow(points, frame)
+        sightings = bench.follow(points, frame, edges=False)
         if sightings.visible.all():
             scores.held.append(valid)
         if valid:
             judge(scores, edges, camera, sightings.pixels)
-    return scores
+    return scores.finish()
 
 
 def judge(scores: Scores, edges: GapEdges, camera: FisheyeCamera, true_pixels: Array) -> None:

@@ -78,7 +78,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         judged += opened
         if asked.no_gap:
             closed = [judge(frame, camera) for frame, camera in rendered(level, asked, is_open=False)]
-            print(f"level {level}  false gap in {share(closed):.1%} of {len(closed)} closed joints", flush=True)
+            print(
+                f"level {level}  false gap in {share(closed):.1%} of {len(closed)} closed joints", flush=True
+            )
             judged += closed
     for path in asked.real:
         frames = [judge_real(picture) for picture in pictures(path)]
@@ -87,9 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def rendered(
-    level: int, asked: argparse.Namespace, *, is_open: bool
-) -> Iterator[tuple[BenchFrame, Camera]]:
+def rendered(level: int, asked: argparse.Namespace, *, is_open: bool) -> Iterator[tuple[BenchFrame, Camera]]:
     """Frames of every seed and direction, spread over the travel."""
     jobs = [(direction, seed) for direction in asked.travel_direction for seed in asked.seed]
     for direction, seed in tqdm(jobs, desc=f"level {level}", disable=not sys.stderr.isatty()):

@@ -70,7 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def to_and_fro(path: Path, seconds: float) -> Path:
     """A bag of the sample's images and poses, forwards and backwards by turns, with stamps that run on."""
     with BagReader(SAMPLE) as reader:
-        played = [(entry, reader.stamp_ns(entry)) for entry in reader.messages([IMAGE, CAMERA_INFO, BODY_POSE])]
+        played = [
+            (entry, reader.stamp_ns(entry)) for entry in reader.messages([IMAGE, CAMERA_INFO, BODY_POSE])
+        ]
         stamps = [stamp for _, stamp in played if stamp is not None]
         begin, length = min(stamps), max(stamps) - min(stamps) + 8_333_333
         with BagWriter(path, metadata=reader.metadata) as writer:
@@ -160,7 +162,9 @@ def counted(bag: Path, recording: Path, spent: dict[str, float]) -> Run:
 def told(name: str, result: Run) -> None:
     """Print a run."""
     lost = result.sent - result.edges
-    print(f"{name}: {result.sent} images sent, {result.edges} gap_edges received, {lost} lost, {result.valid} valid")
+    print(
+        f"{name}: {result.sent} images sent, {result.edges} gap_edges received, {lost} lost, {result.valid} valid"
+    )
     if result.latencies:
         p50, p99 = 1e3 * np.percentile(result.latencies, [50, 99])
         print(f"  latency p50 {p50:.1f} ms  p99 {p99:.1f} ms")

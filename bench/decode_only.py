@@ -17,9 +17,7 @@ class DecodeOnlyNode(BaseNode):
     def __init__(self) -> None:
         super().__init__("decode_only", health=self.health)
         self._edges = self.create_publisher(GapEdges, "/knee_gap/gap_edges", RESULT_QOS)
-        self.create_subscription(
-            CompressedImage, "/knee_gap/image_raw/compressed", self.on_image, IMAGE_QOS
-        )
+        self.create_subscription(CompressedImage, "/knee_gap/image_raw/compressed", self.on_image, IMAGE_QOS)
 
     def on_image(self, message: CompressedImage) -> None:
         """Decode and answer."""
