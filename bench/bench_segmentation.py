@@ -11,6 +11,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -141,7 +142,7 @@ def judge_real(image: Image) -> Judged:
 
 
 def pictures(path: Path) -> Iterator[Image]:
-    """Every fifth frame of a video, or the pictures of a folder, each as it is and under less and less light."""
+    """Every fifth frame of a video, or a folder of pictures, each as it is and under less and less light."""
     frames: list[Image] = []
     if path.is_dir():
         frames = [np.asarray(cv2.imread(str(file)), np.uint8) for file in sorted(path.glob("*.jpg"))]
@@ -169,7 +170,7 @@ def print_reliability(judged: Sequence[Judged]) -> None:
     if not gaps or not others:
         return
     print("confidence    sections   gaps among them (gaps and others weighted alike)")
-    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+    for low, high in pairwise(BINS):
         inside = [f for f in known if low <= f.confidence < high or (high == 1.0 and f.confidence == 1.0)]
         right = sum(frame.is_gap for frame in inside) / gaps
         wrong = sum(not frame.is_gap for frame in inside) / others

@@ -163,7 +163,8 @@ def told(name: str, result: Run) -> None:
     """Print a run."""
     lost = result.sent - result.edges
     print(
-        f"{name}: {result.sent} images sent, {result.edges} gap_edges received, {lost} lost, {result.valid} valid"
+        f"{name}: {result.sent} images sent, {result.edges} gap_edges received, {lost} lost, "
+        f"{result.valid} valid"
     )
     if result.latencies:
         p50, p99 = 1e3 * np.percentile(result.latencies, [50, 99])

@@ -17,6 +17,7 @@ setup(
     ],
     zip_safe=False,
     entry_points={
+        "knee_gap.gap_truth": ["simulated = knee_gap_simulation.bag_truth:gap_masks"],
         "console_scripts": [
             "contact_sheet = knee_gap_simulation.contact_sheet:main",
             "make_bag = knee_gap_simulation.make_bag:main",

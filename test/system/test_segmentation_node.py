@@ -97,9 +97,7 @@ class Feed:
     def told(self, words: str) -> bool:
         """Whether the latest diagnostics say a word."""
         texts = [
-            status.message
-            for array in self.client.received["/diagnostics"][-1:]
-            for status in array.status
+            status.message for array in self.client.received["/diagnostics"][-1:] for status in array.status
         ]
         return any(words in text for text in texts)
 
@@ -228,7 +226,7 @@ def test_a_picture_that_shows_no_points_is_told(
         edges = feed.send(noisy(picture, 1), encoding)
     assert edges.status in statuses
     assert np.isnan([edges.bearing_0.x, edges.pixel_1[1], edges.angular_error, edges.covariance_0[0]]).all()
-    assert not (edges.hidden_0 or edges.hidden_1)
+    assert (edges.hidden_0, edges.hidden_1) == (False, False)
     feed.client.received["/diagnostics"].clear()
     feed.client.spin_until(lambda: bool(feed.client.received["/diagnostics"]))
     status = feed.client.received["/diagnostics"][-1].status[0]

@@ -94,13 +94,14 @@ class GapEdgeDetector:
         self.end_track()
 
     def choose_near(self, pixel: npt.ArrayLike, camera: Camera) -> str:
-        """As `choose_at`, if the last image shows a gap there; otherwise nothing changes. Returns why not, or ""."""
+        """As `choose_at`, if the last image shows a gap there; otherwise nothing changes, and it says why."""
         if self._image is None:
             return "no image received yet"
         clicked, before = np.asarray(pixel, dtype=np.float64), self._clicked
         height, width = self._image.shape[:2]
         if not (np.isfinite(clicked).all() and (clicked >= -0.5).all() and (clicked < [width, height]).all()):
-            return f"the point must lie in the image of {width}x{height} px, not at {clicked[0]:g}, {clicked[1]:g}"
+            place = f"{clicked[0]:g}, {clicked[1]:g}"
+            return f"the point must lie in the image of {width}x{height} px, not at {place}"
         field = self._finder.find(self._image)
         if field is None or field.depth_inside(clicked) <= 0:
             return "the point lies outside the field of view"
@@ -142,15 +143,16 @@ class GapEdgeDetector:
             edges = GapEdges.without_points(stamp_ns, frame_id, EdgeStatus.UNKNOWN)
         return edges
 
-    def gap_mask(self) -> Image:
-        """Gap of the last image, 255 where it is (h, w); (0, 0) before the first image."""
-        if self._image is None:
+    def gap_mask(self, image: Image | None = None) -> Image:
+        """Gap of an image (h, w, 3), by default the last, 255 where it is (h, w); (0, 0) before the first."""
+        image = self._image if image is None else image
+        if image is None:
             return np.zeros((0, 0), np.uint8)
-        shape = self._image.shape[:2]
-        field = self._finder.find(self._image)
+        shape = image.shape[:2]
+        field = self._finder.find(image)
         if field is None:
             return np.zeros(shape, np.uint8)
-        small, scale = self._working_size(self._image)
+        small, scale = self._working_size(image)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
         dark = self._segmentation(small, inside & ~foreign_bodies(small))
         full = cv2.resize(dark.astype(np.uint8) * 255, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

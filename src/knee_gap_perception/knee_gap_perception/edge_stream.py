@@ -86,7 +86,7 @@ class EdgeStream:
         self._waiting.append(_Waiting(message, stamp_ns(message.header), now_ns))
 
     def ready(self, now_ns: int = 0) -> Iterator[GapEdges]:
-        """Edges of the images that need not wait at a time [ns]; each image is looked at when it is asked for.
+        """Edges of the images that need not wait at a time [ns]; each is looked at when it is asked for.
 
         Until the next is asked for, `latest`, `reason`, `detector` and `overlay` speak of the one just given.
         """
@@ -129,7 +129,7 @@ class EdgeStream:
         return edges
 
     def choose(self, column: float, row: float) -> str:
-        """Begin anew at the gap nearest to a pixel of the last image; returns why not, or "" where it is done."""
+        """Begin anew at the gap nearest to a pixel of the last image; says why not, nothing if it is done."""
         if self._camera is None:
             return self._camera_flaw
         return self.detector.choose_near([column, row], self._camera)

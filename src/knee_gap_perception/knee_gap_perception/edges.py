@@ -32,10 +32,11 @@ class GapEdges:
     """The two points G0 and G1 in one image; the fields of knee_gap_msgs/GapEdges.
 
     `stamp_ns` is the exposure time [ns]; `frame_id` the optical frame of the lens. `track_id` is 0 without a
-    track; the same id means the same two points. `hidden` tells of each point that the image does not show it
-    and it is only carried on; `pose_used` whether the pose of the lens guided the search. `bearings` (2, 3) are unit vectors, `pixels` (2, 2) columns
+    track; the same id means the same two points. `bearings` (2, 3) are unit vectors, `pixels` (2, 2) columns
     and rows, `covariances` (2, 3, 3) those of the unit vectors [rad^2], and `angular_error` bounds the angle
-    between each bearing and its true direction [rad]. Unknown numbers are NaN.
+    between each bearing and its true direction [rad]. `hidden` tells of each point that the image does not
+    show it and it is only carried on; `pose_used` whether the pose of the lens guided the search. Unknown
+    numbers are NaN.
     """
 
     stamp_ns: int

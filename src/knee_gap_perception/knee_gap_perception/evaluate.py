@@ -14,27 +14,14 @@ from tqdm import tqdm
 
 from knee_gap_perception.calibration.bag_input import CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.camera import Camera, EquiangularCamera
+from knee_gap_perception.camera import Camera, EquiangularCamera, camera_from_info
 from knee_gap_perception.difference_picture import difference_picture, panel
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.field_of_view import FieldOfViewFinder
-from knee_gap_perception.image_error import EdgeError, Mask, Overlap, edge_error, overlap, rms
-from knee_gap_perception.segmentation.choice import segmentation_named
+from knee_gap_perception.evaluation_pairs import SHEET_ROWS, BagTopics, Pair, bag_pairs, folder_pairs, is_bag
+from knee_gap_perception.image_error import EdgeError, Overlap, edge_error, overlap, rms
+from knee_gap_perception.segmentation.choice import STRATEGIES
 
 Image = npt.NDArray[np.uint8]
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-SHEET_ROWS = 8
-
-
-class Pair(NamedTuple):
-    """A predicted and a marked mask (h, w), the set and name they go by, and the picture if there is one."""
-
-    image_set: str
-    name: str
-    predicted: Mask
-    marked: Mask
-    picture: Image | None
 
 
 class Row(NamedTuple):
@@ -44,56 +31,6 @@ class Row(NamedTuple):
     name: str
     overlap: Overlap
     error: EdgeError | None
-
-
-def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[int, Iterator[Pair]]:
-    """Masks of two folders with the same name but for the suffix; a subfolder is a set of its own.
-
-    Raises PerceptionError for folders that are missing or share no name, and for files that are no images.
-    """
-    predictions, marks = _files(predicted), _files(marked)
-    views = _files(pictures) if pictures else {}
-    names = sorted(predictions.keys() & marks.keys())
-    if not names:
-        raise PerceptionError(f"no mask in {predicted} has the name of one in {marked}")
-    if unpaired := len(predictions.keys() ^ marks.keys()):
-        print(f"evaluate: {unpaired} masks have no partner and are left out", file=sys.stderr)
-
-    def pairs() -> Iterator[Pair]:
-        for name in names:
-            view = _image(views[name]) if name in views else None
-            folder = name.parent.as_posix()
-            label = "all" if folder == "." else folder
-            yield Pair(label, name.name, _mask(predictions[name]), _mask(marks[name]), view)
-
-    return len(names), pairs()
-
-
-def bag_pairs(
-    bag: Path, image_topic: str, truth_topic: str, mask_topic: str | None, segmentation: str
-) -> tuple[int, Iterator[Pair]]:
-    """Masks of a bag with truth, predicted by a recorded topic or else by a segmentation run on the images.
-
-    Raises PerceptionError for topics that are not in the bag and for stamps that have no partner.
-    """
-    source = CalibrationBag(bag)
-    truth = {stamp: image[..., 0] > 127 for stamp, image in source.images(truth_topic)}
-
-    def predictions() -> Iterator[tuple[int, Mask, Image | None]]:
-        if mask_topic is not None:
-            yield from ((stamp, image[..., 0] > 127, None) for stamp, image in source.images(mask_topic))
-            return
-        segment, finder = segmentation_named(segmentation), FieldOfViewFinder()
-        for stamp, image in source.images(image_topic):
-            if stamp in truth and (field := finder.find(image)) is not None:
-                yield stamp, np.asarray(segment(image, field.mask(image.shape[:2])), dtype=bool), image  # type: ignore[arg-type]
-
-    pairs = (
-        Pair(bag.stem, str(stamp), mask, truth[stamp], picture)
-        for stamp, mask, picture in predictions()
-        if stamp in truth
-    )
-    return len(truth), pairs
 
 
 def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Row]:
@@ -118,7 +55,7 @@ def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Ro
                 panel(f"{pair.image_set} {pair.name}", [*pictures, pair.marked, pair.predicted, difference])
             )
     if not rows:
-        raise PerceptionError("no predicted mask has the stamp of a true one")
+        raise PerceptionError("no predicted mask has the stamp or name of a true one")
     _write_sheet(sheet, out / "sheet.png")
     return rows
 
@@ -195,66 +132,74 @@ def _write_sheet(rows: Sequence[Image], path: Path) -> None:
     cv2.imwrite(str(path), np.vstack(padded))
 
 
-def _files(folder: Path) -> dict[Path, Path]:
-    if not folder.is_dir():
-        raise PerceptionError(f"{folder} is no folder")
-    return {
-        path.relative_to(folder).with_suffix(""): path
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in SUFFIXES
-    }
-
-
-def _image(path: Path) -> Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise PerceptionError(f"{path} is no image that can be read")
-    return np.asarray(image, dtype=np.uint8)
-
-
-def _mask(path: Path) -> Mask:
-    """The gap is what is brighter than half; in masks of 0 and 1, what is 1."""
-    image = _image(path).max(axis=2)
-    return np.asarray(image > (0 if image.max() <= 1 else 127))
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
-    parser.add_argument("predicted", type=Path, help="folder of predicted masks, or a bag with truth")
-    parser.add_argument("marked", type=Path, nargs="?", help="folder of hand-marked masks of the same names")
+    parser.add_argument("predicted", type=Path, help="folder of predicted masks, or a bag")
+    parser.add_argument(
+        "marked",
+        type=Path,
+        nargs="?",
+        help="folder of hand-marked masks of the same names, or a bag with truth",
+    )
     parser.add_argument(
         "--pictures", type=Path, metavar="FOLDER", help="the images themselves, for the sheet"
     )
     parser.add_argument("--out", type=Path, default=Path("out/evaluate"), metavar="FOLDER")
     parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="camera; without it the paper's 90 x 90 degrees"
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="camera; without it a bag's own camera_info, and the paper's 90 x 90 degrees for folders",
     )
-    parser.add_argument("--image-topic", default="/knee_gap/image_raw/compressed")
-    parser.add_argument("--truth-topic", default="/knee_gap/gap_mask_true")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="of a bag, every N-th image (1)")
+    parser.add_argument("--camera-info-topic", default="/knee_gap/camera_info", metavar="TOPIC")
+    parser.add_argument("--image-topic", default="/knee_gap/image_raw/compressed", metavar="TOPIC")
+    parser.add_argument("--mask-topic", default="/knee_gap/gap_mask", metavar="TOPIC", help="predicted masks")
     parser.add_argument(
-        "--mask-topic", help="predicted masks of the bag; without it the images are segmented"
+        "--truth-topic", default="/knee_gap/gap_mask_true", metavar="TOPIC", help="true masks"
     )
-    parser.add_argument("--segmentation", default="otsu", help="how, where images are segmented")
+    parser.add_argument(
+        "--segmentation",
+        choices=[name for name in STRATEGIES if name != "onnx"],
+        help="segment the bag's images so; without it, if the bag has no masks, as segmentation_node does",
+    )
     return parser
+
+
+def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
+    """The pairs that the arguments name. Raises PerceptionError."""
+    if arguments.every < 1:
+        raise PerceptionError(f"--every must be at least 1, not {arguments.every}")
+    if not is_bag(arguments.predicted):
+        if arguments.marked is None:
+            raise PerceptionError(
+                f"{arguments.predicted} is no bag, it has no metadata.yaml: "
+                "name the folder of marked masks as well"
+            )
+        return folder_pairs(arguments.predicted, arguments.marked, arguments.pictures)
+    truth = arguments.marked or arguments.predicted
+    topics = BagTopics(arguments.image_topic, arguments.mask_topic, arguments.truth_topic)
+    return bag_pairs(arguments.predicted, truth, topics, arguments.segmentation, arguments.every)
+
+
+def _camera(arguments: argparse.Namespace) -> Camera | None:
+    """The camera that the arguments, or the bags, name. Raises PerceptionError for one that is none."""
+    if arguments.calibration is not None:
+        return load_calibration(arguments.calibration).require_camera().camera()
+    for path in (arguments.marked, arguments.predicted):
+        if path is not None and is_bag(path):
+            info = CalibrationBag(path).camera_info(arguments.camera_info_topic)
+            if info is not None:
+                return camera_from_info(info)
+    return None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Evaluate; 0 when everything was judged and written."""
     arguments = _parser().parse_args(argv)
     try:
-        camera = None
-        if arguments.calibration is not None:
-            camera = load_calibration(arguments.calibration).require_camera().camera()
-        if arguments.marked is None:
-            count, pairs = bag_pairs(
-                arguments.predicted,
-                arguments.image_topic,
-                arguments.truth_topic,
-                arguments.mask_topic,
-                arguments.segmentation,
-            )
-        else:
-            count, pairs = folder_pairs(arguments.predicted, arguments.marked, arguments.pictures)
+        camera = _camera(arguments)
+        count, pairs = _pairs(arguments)
         arguments.out.mkdir(parents=True, exist_ok=True)
         rows = evaluate(_progress(pairs, count), camera, arguments.out)
         write_csv(rows, arguments.out)

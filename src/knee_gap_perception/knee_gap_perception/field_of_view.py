@@ -231,7 +231,9 @@ class FieldOfViewFinder:
     REFRESH_EVERY = (
         120  # images after which a disc is found anew: the camera turns and shifts on the eyepiece
     )
-    CHECK_EVERY = 4  # images, of which one is looked at for picture where there should be none, and the reverse
+    CHECK_EVERY = (
+        4  # images, of which one is looked at for picture where there should be none, and the reverse
+    )
     MISFITS = 3  # of these in a row, after which the disc is found anew
 
     def __init__(self) -> None:

@@ -25,8 +25,8 @@ def gap_confidence(section: Section, field_radius: float, image: Image, dark: Ma
     """Confidence [0, 1] that a section through dark pixels (h, w) of an image (h, w, 3) is a gap.
 
     A gap is dark against the tissue on both sides, ends sharply, is open and evenly dark. Shaded tissue is a
-    little darker than its surroundings, ends slowly, is ragged, so that no large disc fits into it, and uneven.
-    `field_radius` [px] is in the pixels of the section.
+    little darker than its surroundings, ends slowly, is ragged, so that no large disc fits into it, and
+    uneven. `field_radius` [px] is in the pixels of the section.
     """
     evidence = (
         CONTRAST_WEIGHT * max(float(section.contrast.min()), LEAST_CONTRAST)

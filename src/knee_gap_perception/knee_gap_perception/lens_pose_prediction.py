@@ -37,7 +37,7 @@ class LensPosePredictor:
         self._poses.append(pose)
 
     def expects_after(self, stamp_ns: int) -> bool:
-        """Whether a pose that follows a stamp [ns] is still to come, from a tracker that has not fallen silent."""
+        """Whether a pose after a stamp [ns] is still to come, from a tracker that has not fallen silent."""
         if not self._poses:
             return False
         return 0 < stamp_ns - self._poses[-1].stamp_ns <= LONGEST_AHEAD_NS

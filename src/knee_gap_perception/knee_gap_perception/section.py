@@ -131,7 +131,7 @@ def _section_through(
 
 
 def _sharpness(centre: Array, ends: Array, value: Image) -> Array:
-    """Largest rise outwards over SHARP pixels against the range around each end (2, 2): median of lines (2,)."""
+    """Largest rise outwards over SHARP pixels against the range around each end (2, 2), median of lines."""
     smooth = cv2.GaussianBlur(value, (0, 0), 1.0).astype(np.float32)
     outward = (ends - centre) / np.linalg.norm(ends - centre, axis=1, keepdims=True)
     along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)

@@ -51,7 +51,7 @@ class GapPipeline:
     def from_parameters(
         cls, file: ParametersFile, topics: InputTopics, space: str, *, with_mask: bool = False
     ) -> Self:
-        """Return a pipeline of cores with the parameters of the nodes in `file`; `with_mask` as in GapPipeline.
+        """Return a pipeline of cores with the parameters of the nodes in `file`; `with_mask` as for itself.
 
         Raises BagError for parameters that no core has or that one refuses.
         """

@@ -30,9 +30,9 @@ class EdgeObservation:
     `stamp_ns` is the exposure time [ns]; `bearings` (2, 3) unit vectors in the lens frame; `covariances`
     (2, 3, 3) of the unit vectors [rad^2]; `angular_error` bounds each bearing's angle to the truth [rad].
     `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code,
-    `frame_id` the lens frame. `hidden` is true where a bearing is a prediction from earlier images: those have
-    been counted, and counting them again would make the fit too sure. `pose_used` says that the pose of the
-    lens guided the search, so that bearings and pose share some of their errors.
+    `frame_id` the lens frame. `hidden` is true where a bearing is a prediction from earlier images: those
+    have been counted, and counting them again would make the fit too sure. `pose_used` says that the pose of
+    the lens guided the search, so that bearings and pose share some of their errors.
     """
 
     stamp_ns: int

@@ -126,7 +126,7 @@ def test_waiting_images_are_few_and_keep_their_order(joint: Any, travel: Any) ->
     made = stream(joint, wait=0.1)
     still_poses(made, 9 * POSE_NS)
     stamps = [9 * POSE_NS + MS * (k + 1) for k in range(MOST_WAITING + 4)]
-    found = []
+    found: list[GapEdges] = []
     for stamp in stamps:
         made.on_image(image_message(travel[1][0], stamp), now_ns=0)
         found += made.ready(0)
@@ -165,7 +165,7 @@ def test_poses_in_another_frame_begin_another_track(joint: Any, travel: Any) -> 
 
 def test_a_point_behind_a_probe_is_called_hidden(joint: Any, travel: Any) -> None:
     made = stream(joint, wait=0.0)
-    found = []
+    found: list[GapEdges] = []
     for k in range(8):
         picture = joint.picture(np.eye(4), k)
         if 3 <= k < 6:

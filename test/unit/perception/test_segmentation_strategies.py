@@ -73,7 +73,7 @@ def test_otsu_parts_two_and_three_groups() -> None:
 
 
 def test_light_that_falls_to_the_rim_is_evened(drawn: tuple[Image, Mask, Mask]) -> None:
-    """A veiled gap whose middle is as bright as the tissue at the rim: no threshold parts them as they are."""
+    """A veiled gap whose middle is as bright as tissue at the rim: no threshold parts them as they are."""
     _, field, gap = drawn
     rows, columns = np.mgrid[0:180, 0:320].astype(float)
     lit = np.where(gap, 75.0, 150.0) * np.exp(-0.9 * ((rows - 90) ** 2 + (columns - 160) ** 2) / 86**2)

@@ -65,6 +65,17 @@ class CalibrationBag:
         for stamp, message, msgtype in self._messages(topic, tuple(IMAGE_TYPES)):
             yield stamp, IMAGE_TYPES[msgtype](message)
 
+    def has(self, topic: str) -> bool:
+        """Whether the bag has messages on a topic."""
+        with _opened(self.path) as reader:
+            return any(c.topic == topic and c.msgcount for c in reader.connections)
+
+    def camera_info(self, topic: str) -> Any | None:
+        """The first sensor_msgs/CameraInfo on a topic; None where there is none."""
+        if not self.has(topic):
+            return None
+        return next(iter(self._messages(topic, ("sensor_msgs/msg/CameraInfo",))))[1]
+
     def image_stamps(self, topic: str) -> npt.NDArray[np.int64]:
         """Stamps [ns] of every image, none decoded."""
         return np.array([stamp for stamp, _, _ in self._messages(topic, tuple(IMAGE_TYPES))], dtype=np.int64)

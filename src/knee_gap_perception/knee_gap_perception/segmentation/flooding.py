@@ -13,10 +13,10 @@ GAP, TISSUE = 1, 2
 class Watershed:
     """Floods the gradient of brightness from what is surely gap and what is surely tissue.
 
-    Sure is what lies clear of the threshold between the dark and the middle of three classes, tissue only from
-    well within the middle class on: shaded bone behind a rim belongs to the gap, and the step at the rim is
-    higher than the one behind it. Between, the border is where brightness changes fastest, whatever its level
-    there: a veil of fluid or a shaded flank shifts the level, not the step.
+    Sure is what lies clear of the threshold between the dark and the middle of three classes, tissue only
+    from well within the middle class on: shaded bone behind a rim belongs to the gap, and the step at the rim
+    is higher than the one behind it. Between, the border is where brightness changes fastest, whatever its
+    level there: a veil of fluid or a shaded flank shifts the level, not the step.
     """
 
     MARGIN = 24.0  # [levels of the logarithm] on either side of the threshold, within which nothing is sure

@@ -8,6 +8,7 @@ from knee_gap_perception.field_of_view import brightness
 from knee_gap_perception.segmentation.even_light import even_light
 from knee_gap_perception.segmentation.strategy import Image, Mask
 
+
 def otsu_threshold(values: npt.NDArray[np.uint8]) -> float:
     """Otsu's threshold of values (n,): the last value of the dark class."""
     threshold, _ = cv2.threshold(values.reshape(1, -1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
