@@ -38,13 +38,16 @@ class ErrorCloud(NamedTuple):
 
     `points` (3, 8, rings): coordinates, spokes, rings, coarsely in order of length; `starts`: where the
     slices of each spoke begin, with the end of the last. `far` (3, 8, more): rings for rays that do not meet,
-    drawn at a great distance. `smallest_angle`: least angle alpha', beta' or pi less one of them [rad];
-    where it leaves no triangle, the cloud is empty.
+    drawn at a great distance. `shortest` and `longest` of all rays [m], the latter at most that distance.
+    `smallest_angle`: least angle alpha', beta' or pi less one of them [rad]; where it leaves no triangle, the
+    cloud is empty.
     """
 
     points: npt.NDArray[np.float64]
     starts: npt.NDArray[np.int64]
     far: npt.NDArray[np.float64]
+    shortest: float
+    longest: float
     smallest_angle: float
 
 
@@ -64,7 +67,7 @@ def trace_cloud(
     lengths, smallest_angle = ring_lengths(travel, own, other, angular_error, shifts, signs)
     if not smallest_angle > SMALLEST_ANGLE:
         nothing = np.empty((3, SPOKES, 0))
-        return ErrorCloud(nothing, np.zeros(1, np.int64), nothing, smallest_angle)
+        return ErrorCloud(nothing, np.zeros(1, np.int64), nothing, math.nan, math.nan, smallest_angle)
     places, starts = places_by_inverse(lengths[lengths < math.inf])
     points = np.empty((3, SPOKES, places.size))
     far = np.empty((3, SPOKES, lengths.size - places.size))
@@ -82,7 +85,10 @@ def trace_cloud(
                 else:
                     draw_ring(far, ring - drawn, apex, own, across, FAR * norm(travel), angular_error)
                 ring += 1
-    return ErrorCloud(points, starts, far, smallest_angle)
+    endless = FAR * norm(travel)
+    return ErrorCloud(
+        points, starts, far, min(lengths.min(), endless), min(lengths.max(), endless), smallest_angle
+    )
 
 
 @compiled

@@ -44,9 +44,10 @@ MEDIAN_CHI_SQUARE_2 = 1.3863
 # Between these deviations of chi-square from its expectation the scale goes from 1 to the ratio of the two:
 # chance alone does not widen an interval, and the interval does not jump where evidence begins.
 SCALE_RAMP = (1.5, 2.5)
-# A share of exactly 1 would leave the bearings no error of their own, and their covariance without an
-# inverse.
-LARGEST_COMMON_SHARE = 0.99
+# A share of exactly 1 would leave the bearings no error of their own: without other errors their covariance
+# has no inverse, and what is left of their information is a difference of equal numbers. One per cent of the
+# variance, a tenth of the deviation, is no small remainder: over a short travel it doubles the interval.
+LARGEST_COMMON_SHARE = 1.0 - 1e-6
 # An inverse depth [1/m] below which a point is as good as at infinity.
 AT_INFINITY = 1e-6
 # Where nearly all of the error is common, residuals say nothing of its scale, however small they should be.
