@@ -22,7 +22,13 @@ NODES = {
     "uncertainty_node": "knee_gap_uncertainty",
 }
 NAMESPACE = "/knee_gap"
-RECORDED = (EDGES, f"{NAMESPACE}/scope_pose", GAP, *(f"{GAP}/{name}" for name in ("min", "max", "snr")))
+RECORDED = (
+    EDGES,
+    f"{NAMESPACE}/scope_pose",
+    f"{NAMESPACE}/scope_calibration",
+    GAP,
+    *(f"{GAP}/{name}" for name in ("min", "max", "snr")),
+)
 RECORDING = "gap.mcap"
 # Time the nodes have to come up: the first start after a build compiles the kernels.
 START_TIMEOUT = 120.0
@@ -42,7 +48,7 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
             if rate != 1.0:
                 # Waiting is then measured by the bag's clock.
                 command += ["-p", "use_sim_time:=true"]
-            if node == "tracking_node":
+            if node != "uncertainty_node":
                 command += ["--params-file", str(bag / PARAMETERS_FILE)]
             if node == "segmentation_node":
                 command += ["-p", "image_transport:=compressed"]

@@ -20,7 +20,7 @@ from launch_ros.actions import Node
 
 SHARE = Path(get_package_share_directory("knee_gap_bringup"))
 INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
-OUTPUTS = ("gap_edges", "scope_pose", "gap", "gap/min", "gap/max", "gap/snr")
+OUTPUTS = ("gap_edges", "scope_pose", "scope_calibration", "gap", "gap/min", "gap/max", "gap/snr")
 # Time for the last image to pass through the nodes [s].
 DRAIN = 1.0
 
@@ -33,7 +33,7 @@ def start(context: object) -> list[object]:
     given = LaunchConfiguration("params").perform(context)
     # A simulated bag carries the place of the lens on the tracked body beside it.
     beside = Path(bag) / "scope.yaml"
-    tracking = [str(beside)] if not given and beside.is_file() else [given] if given else []
+    parameters = [str(beside)] if not given and beside.is_file() else [given] if given else []
     player = Node(
         package="knee_gap_replay",
         executable="play",
@@ -55,13 +55,13 @@ def start(context: object) -> list[object]:
             package="knee_gap_perception",
             executable="segmentation_node",
             namespace=namespace,
-            parameters=[{"image_transport": "compressed"}],
+            parameters=[*parameters, {"image_transport": "compressed"}],
         ),
         Node(
             package="knee_gap_perception",
             executable="tracking_node",
             namespace=namespace,
-            parameters=tracking,
+            parameters=parameters,
         ),
         Node(package="knee_gap_uncertainty", executable="uncertainty_node", namespace=namespace),
     ]
@@ -83,7 +83,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("out", default_value="", description="bag to record the results in"),
             DeclareLaunchArgument("rate", default_value="1.0"),
             DeclareLaunchArgument(
-                "params", default_value="", description="parameters of tracking_node; scope.yaml of the bag"
+                "params", default_value="", description="parameters of the nodes; scope.yaml of the bag"
             ),
             DeclareLaunchArgument("namespace", default_value="knee_gap"),
             IncludeLaunchDescription(transport),

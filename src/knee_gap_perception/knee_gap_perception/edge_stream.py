@@ -8,6 +8,8 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.camera_check import disagreement
 from knee_gap_perception.camera import Camera, camera_from_info
 from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
@@ -40,10 +42,17 @@ class _Waiting(NamedTuple):
 class EdgeStream:
     """Takes messages by field name; whatever is wrong with one is a status, a reason and a count.
 
-    Images are handed in by `on_image` and come out, in order, as edges from `ready`.
+    Images are handed in by `on_image` and come out, in order, as edges from `ready`. With a `calibration` the
+    camera is its own, whatever camera_info says, and images of another size are refused. Raises
+    PerceptionError for a calibration without a camera.
     """
 
-    def __init__(self, parameters: EdgeParameters | None = None, poses: PoseParameters | None = None) -> None:
+    def __init__(
+        self,
+        parameters: EdgeParameters | None = None,
+        poses: PoseParameters | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
         self.detector = GapEdgeDetector(parameters)
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
@@ -52,6 +61,11 @@ class EdgeStream:
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
         self._camera_key: tuple[object, ...] = ()
+        self.calibration = calibration
+        # Why the images are none of the calibration's; empty where they are.
+        self.size_flaw = ""
+        if calibration is not None:
+            self._camera, self._camera_flaw = calibration.require_camera().camera(), ""
         self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
         self._poses = LensPosePredictor()
         self._waiting: deque[_Waiting] = deque()
@@ -67,12 +81,25 @@ class EdgeStream:
         if key == self._camera_key:
             return
         self._camera_key = key
+        if self.calibration is not None:
+            self._compare(message)
+            return
         # Bearings by another model are not comparable with those before.
         self.detector.end_track()
         try:
             self._camera, self._camera_flaw = camera_from_info(message), ""
         except PerceptionError as error:
             self._camera, self._camera_flaw = None, str(error)
+
+    def _compare(self, message: Any) -> None:
+        """Count a camera_info that contradicts the calibration, which is used all the same."""
+        assert self.calibration is not None
+        try:
+            told = camera_from_info(message)
+        except PerceptionError:
+            return  # an uncalibrated driver's is all zeros
+        if angle := disagreement(self.calibration.require_camera().camera(), told):
+            self.counts[f"camera_info differs from the calibration by {angle}: the calibration is used"] += 1
 
     def on_lens_pose(self, message: Any) -> None:
         """Take a pose of the lens, a geometry_msgs/PoseWithCovarianceStamped; a bad one is left out."""
@@ -111,6 +138,7 @@ class EdgeStream:
             is_compressed = hasattr(message, "format")
             image = image_from_compressed(message) if is_compressed else image_from_message(message)
             self._image = image
+            self._refuse_other_size(image)
             if self._camera is None:
                 raise PerceptionError(self._camera_flaw)
             lens_pose = self._poses.at(stamp)
@@ -127,6 +155,16 @@ class EdgeStream:
         if edges.status is EdgeStatus.VALID and any(edges.hidden):
             self.counts["VALID, a point hidden"] += 1
         return edges
+
+    def _refuse_other_size(self, image: Image) -> None:
+        self.size_flaw = ""
+        if self.calibration is None:
+            return
+        try:
+            self.calibration.require_image_size(image.shape[1], image.shape[0])
+        except PerceptionError as error:
+            self.size_flaw = str(error)
+            raise
 
     def choose(self, column: float, row: float) -> str:
         """Begin anew at the gap nearest to a pixel of the last image; says why not, nothing if it is done."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from knee_gap_perception.calibration.calibration_file import Calibration
 from knee_gap_perception.poses import BodyPose, LensPose
 
 
@@ -37,6 +38,26 @@ def fill_lens_transform(message: Any, lens: LensPose) -> Any:
     shift = message.transform.translation
     shift.x, shift.y, shift.z = (float(value) for value in lens.position)
     _fill_quaternion(message.transform.rotation, lens)
+    return message
+
+
+def fill_scope_calibration(message: Any, node: str, calibration: Calibration | None) -> Any:
+    """Set every field of a knee_gap_msgs/ScopeCalibration; returns the message.
+
+    `node` is who says it. Only tracking_node uses the lens on the body and the clock.
+    """
+    message.node, message.hash = node, calibration.hash if calibration else ""
+    covariance = np.full((6, 6), np.nan)
+    message.time_offset = message.time_offset_error = float("nan")
+    if calibration is not None:
+        message.width_px, message.height_px = calibration.width_px, calibration.height_px
+    if calibration is not None and node == "tracking_node":
+        # The calibration's order is rotation first, REP-103's is position first.
+        covariance = np.roll(calibration.require_lens().covariance, 3, axis=(0, 1))
+        if calibration.clock is not None:
+            message.time_offset = calibration.clock.offset
+            message.time_offset_error = calibration.clock.sigma
+    message.lens_covariance = np.array(covariance, dtype=np.float64).reshape(36)
     return message
 
 

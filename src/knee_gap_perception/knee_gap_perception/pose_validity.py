@@ -36,6 +36,7 @@ class RefusalReason(StrEnum):
     JUMP = "jump"
     GAP = "gap"
     NO_REFERENCE = "no_reference"
+    NO_TURN = "no_turn"
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,17 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
-from knee_gap_msgs.msg import GapEdges
+from knee_gap_msgs.msg import GapEdges, ScopeCalibration
 from knee_gap_msgs.srv import ChoosePoint
-from knee_gap_node.base_node import IMAGE_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_node.errors import ConfigurationError
+from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
+from knee_gap_perception.messages_tracking import fill_scope_calibration
 from knee_gap_perception.segmentation_parameters import PoseParameters, TransportParameters
 from knee_gap_perception.warm_up import warm_up
 
@@ -27,8 +31,12 @@ class SegmentationNode(BaseNode):
         super().__init__("segmentation_node", health=self.health)
         transport = self.declare(TransportParameters).image_transport
         poses = self.declare(PoseParameters)
-        self._stream = EdgeStream(self.declare(EdgeParameters), poses)
+        edges, calibration = self.declare(EdgeParameters), self.declare(CalibrationParameters)
         self.refuse_unknown_parameters()
+        try:
+            self._stream = EdgeStream(edges, poses, calibration.load())
+        except PerceptionError as error:
+            raise ConfigurationError(str(error)) from error
         # Compiled before the first image, so that its answer is not late.
         warm_up()
         self._dropped = 0
@@ -46,6 +54,9 @@ class SegmentationNode(BaseNode):
         self.create_service(Trigger, "start_anew", self.on_start_anew)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, TRACKER_QOS)
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
+        self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
+        told = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
+        self._calibration.publish(told)
         # Runs while an image waits for its pose, so that it does not wait longer than it may.
         self._patience = self.create_timer(max(poses.max_pose_wait, 0.001), self.publish_ready)
         self._patience.cancel()
@@ -126,7 +137,8 @@ class SegmentationNode(BaseNode):
         """Status of the latest image, and how often each status came."""
         latest = self._stream.latest
         well = latest is not None and latest.status is EdgeStatus.VALID
-        return well, self._stream.reason, {**self._stream.counts, "images dropped": self._dropped}
+        counts = {**self._stream.counts, "images dropped": self._dropped}
+        return well, self._stream.reason, {"calibration": hash_or_none(self._stream.calibration), **counts}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,17 +1,22 @@
 """Where the lens is: a tracked body, and the scope fixed to it, to the pose of the lens with its error."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import pi, radians
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
 from knee_gap_perception.pose_validity import PoseValidity, Refusal, RefusalReason, ValidityParameters
 from knee_gap_perception.poses import Array, BodyPose, LensPose, cross_matrix, rigid_transform
 from knee_gap_perception.reference_body import relative_to
+
+# What says where the lens sits, unless a calibration does.
+PLACE_OF_LENS = ("body_to_shaft_translation", "body_to_shaft_quaternion_xyzw", "oblique_angle")
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,13 @@ class TrackingParameters:
             "name as frame; empty gives it in frame_id"
         },
     )
+    scope_turn_body: str = field(
+        default="",
+        metadata={
+            "description": "Second tracked body, on an oblique scope whose camera head carries the first: it "
+            "tells how far the scope is turned; needs a calibration_file made with it; empty: not turned"
+        },
+    )
 
     def __post_init__(self) -> None:
         for name, length in (("body_to_shaft_translation", 3), ("body_to_shaft_quaternion_xyzw", 4)):
@@ -110,15 +122,24 @@ class ScopeTracker:
     """Turns the poses of the tracked body, in the order in which they come, into poses of the lens."""
 
     def __init__(
-        self, parameters: TrackingParameters | None = None, validity: ValidityParameters | None = None
+        self,
+        parameters: TrackingParameters | None = None,
+        validity: ValidityParameters | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         self.parameters = parameters or TrackingParameters()
+        self.calibration = calibration
+        _refuse_contradictions(self.parameters, calibration)
         self.validity = PoseValidity(validity)
         self.reference_validity = PoseValidity(validity)
+        self.turn_validity = PoseValidity(validity)
         self.accepted_count = 0
-        T_body_lens = self.parameters.body_to_lens()
-        self._R_body_lens = Rotation.from_matrix(T_body_lens[:3, :3])
-        self._lever = T_body_lens[:3, 3]
+        T_body_lens = calibration.body_to_lens() if calibration else self.parameters.body_to_lens()
+        self._T_body_lens = T_body_lens
+        # An image's stamp plus this is the tracker's clock.
+        clock = calibration.clock if calibration else None
+        self._clock_offset_ns = round(clock.offset * 1e9) if clock else 0
+        self.turn = 0.0
 
     def update(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> LensPose | Refusal:
         """Return the pose of the lens at the stamp of `body`, or why there is none.
@@ -134,9 +155,15 @@ class ScopeTracker:
         refusal = self.validity.check(body, bodies)
         if name and (fault := self._reference_fault(body, reference, bodies)) and refusal is None:
             refusal = self.validity.refuse(body, RefusalReason.NO_REFERENCE, fault)
+        turn_name = self.parameters.scope_turn_body
+        second = next((other for other in bodies if turn_name and other.name == turn_name), None)
+        if turn_name and (fault := self._turn_fault(body, second, bodies)) and refusal is None:
+            refusal = self.validity.refuse(body, RefusalReason.NO_TURN, fault)
         if refusal is not None:
             return refusal
         self.accepted_count += 1
+        if second is not None:
+            self._note_turn(body, second)
         lens = self._lens_pose(body)
         return lens if reference is None else relative_to(lens, reference, self._body_covariance())
 
@@ -144,31 +171,41 @@ class ScopeTracker:
         """Start afresh, as after a change of the set-up; the counts go on."""
         self.validity.reset()
         self.reference_validity.reset()
+        self.turn_validity.reset()
 
     def _reference_fault(
         self, body: BodyPose, reference: BodyPose | None, bodies: tuple[BodyPose, ...]
     ) -> str | None:
-        name = self.parameters.reference_body
-        if reference is None:
-            return f"the reference body '{name}' is not in the frame"
-        if reference.stamp_ns != body.stamp_ns:
-            return f"the reference body '{name}' has another stamp than the scope"
-        rest = tuple(other for other in bodies if other is not reference)
-        refusal = self.reference_validity.check(reference, (body, *rest))
-        return None if refusal is None else f"reference body '{name}': {refusal.detail}"
+        what = f"the reference body '{self.parameters.reference_body}'"
+        return _fault(self.reference_validity, what, reference, body, bodies)
+
+    def _turn_fault(
+        self, body: BodyPose, second: BodyPose | None, bodies: tuple[BodyPose, ...]
+    ) -> str | None:
+        what = f"the body '{self.parameters.scope_turn_body}' on the scope"
+        return _fault(self.turn_validity, what, second, body, bodies)
+
+    def _note_turn(self, body: BodyPose, second: BodyPose) -> None:
+        assert self.calibration is not None  # scope_turn_body is refused without one
+        head = rigid_transform(body.position, body.quaternion_xyzw)
+        scope = rigid_transform(second.position, second.quaternion_xyzw)
+        self.turn = self.calibration.scope_turn_of_body(np.linalg.inv(head) @ scope)
 
     def _lens_pose(self, body: BodyPose) -> LensPose:
         parameters = self.parameters
         R_world_body = Rotation.from_quat(body.quaternion_xyzw)
-        lever = R_world_body.apply(self._lever)
-        quaternion = (R_world_body * self._R_body_lens).as_quat(canonical=True)
+        T_body_lens = self._T_body_lens
+        if self.calibration is not None and self.turn:
+            T_body_lens = self.calibration.body_to_lens(self.turn)
+        lever = R_world_body.apply(T_body_lens[:3, 3])
+        quaternion = (R_world_body * Rotation.from_matrix(T_body_lens[:3, :3])).as_quat(canonical=True)
         return LensPose(
-            stamp_ns=body.stamp_ns,
+            stamp_ns=body.stamp_ns - self._clock_offset_ns,
             frame_id=parameters.frame_id,
             child_frame_id=parameters.child_frame_id,
             position=body.position + lever,
             quaternion_xyzw=quaternion,
-            covariance=self._covariance(lever),
+            covariance=self._covariance(lever) + self._axis_covariance(),
         )
 
     def _covariance(self, lever: Array) -> Array:
@@ -180,6 +217,55 @@ class ScopeTracker:
         J[:3, 3:] = -cross_matrix(lever)
         return np.asarray(J @ covariance @ J.T)
 
+    def _axis_covariance(self) -> Array:
+        """What the error of the shaft's axis adds at the present turn: nothing at the calibrated one."""
+        oblique = self.calibration.oblique if self.calibration else None
+        if oblique is None or oblique.axis is None or not self.turn:
+            return np.zeros((6, 6))
+        chord = 2.0 * np.sin(0.5 * self.turn)
+        return np.diag(
+            np.repeat([(chord * oblique.axis_shift_sigma) ** 2, (chord * oblique.axis_tilt_sigma) ** 2], 3)
+        )
+
     def _body_covariance(self) -> Array:
         translation, rotation = self.parameters.translation_error, self.parameters.rotation_error
         return np.diag(np.repeat([translation**2 / 3.0, rotation**2 / 3.0], 3))
+
+
+def _fault(
+    validity: PoseValidity, what: str, other: BodyPose | None, body: BodyPose, bodies: tuple[BodyPose, ...]
+) -> str | None:
+    """Why another body that the lens pose needs cannot be used with the scope's; None where it can."""
+    if other is None:
+        return f"{what} is not in the frame"
+    if other.stamp_ns != body.stamp_ns:
+        return f"{what} has another stamp than the scope"
+    refusal = validity.check(other, (body, *(rest for rest in bodies if rest is not other)))
+    return None if refusal is None else f"{what}: {refusal.detail}"
+
+
+def _refuse_contradictions(parameters: TrackingParameters, calibration: Calibration | None) -> None:
+    """Raise PerceptionError where two settings say different things of the lens, or one needs another."""
+    if calibration is None:
+        if parameters.scope_turn_body:
+            raise PerceptionError("scope_turn_body needs a calibration_file that was made with that body")
+        return
+    calibration.require_lens()
+    defaults = {field.name: field.default for field in fields(TrackingParameters)}
+    given = [name for name in PLACE_OF_LENS if getattr(parameters, name) != defaults[name]]
+    if given:
+        raise PerceptionError(
+            f"calibration_file says where the lens is, and so do {', '.join(given)}: leave one of them out"
+        )
+    oblique = calibration.oblique
+    by_body = oblique is not None and oblique.T_head_scope is not None and oblique.axis is not None
+    if parameters.scope_turn_body and not by_body:
+        raise PerceptionError(
+            f"scope_turn_body is '{parameters.scope_turn_body}', and the calibration knows no second body on "
+            "the scope: run calibrate oblique --scope-pose-topic"
+        )
+    if by_body and not parameters.scope_turn_body and calibration.require_lens().mount is Mount.CAMERA_HEAD:
+        raise PerceptionError(
+            "the calibration was made with a second body on the scope: name it in scope_turn_body, or the "
+            "turn of the scope is not known"
+        )

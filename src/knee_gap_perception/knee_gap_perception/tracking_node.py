@@ -7,10 +7,12 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
-from knee_gap_node.base_node import RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_msgs.msg import ScopeCalibration
+from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
+from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages_tracking import fill_lens_pose
+from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration
 from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
@@ -29,21 +31,24 @@ class TrackingNode(BaseNode):
     def __init__(self) -> None:
         super().__init__("tracking_node", health=self.health)
         parameters = self.declare(TrackingParameters)
-        self._tracker = ScopeTracker(parameters, self.declare(ValidityParameters))
+        validity, calibration = self.declare(ValidityParameters), self.declare(CalibrationParameters)
         source, natnet = self.declare(SourceParameters), self.declare(NatNetParameters)
         self.refuse_unknown_parameters()
         self._accepted_before = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
-            self._feed = ScopeFeed(
-                source, natnet, reference_body=parameters.reference_body, ros_now=self.now_ns
-            )
+            self._tracker = ScopeTracker(parameters, validity, calibration.load())
+            others = tuple(name for name in (parameters.reference_body, parameters.scope_turn_body) if name)
+            self._feed = ScopeFeed(source, natnet, other_bodies=others, ros_now=self.now_ns)
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
+        self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
+        told = fill_scope_calibration(ScopeCalibration(), "tracking_node", self._tracker.calibration)
+        self._calibration.publish(told)
         self._ended = threading.Event()
         self._receiver: threading.Thread | None = None
         if isinstance(self._feed.source, PoseTopics):
-            self.listen_to_poses(self._feed.source, parameters.reference_body)
+            self.listen_to_poses(self._feed.source, parameters)
         elif isinstance(self._feed.source, RigidBodiesTopic):
             self.listen_to_rigid_bodies(self._feed.source)
         else:
@@ -54,12 +59,16 @@ class TrackingNode(BaseNode):
         """Time of ROS, which NatNet's exposures are mapped to."""
         return int(self.get_clock().now().nanoseconds)
 
-    def listen_to_poses(self, source: PoseTopics, reference_body: str) -> None:
-        """Subscribe to the scope's pose, and to the leg's where one is the reference."""
-        topics = {SCOPE: "scope_body/pose"}
-        if reference_body:
-            topics[reference_body] = "reference_body/pose"
+    def listen_to_poses(self, source: PoseTopics, parameters: TrackingParameters) -> None:
+        """Subscribe to the scope's pose, the leg's where one is the reference, a second body of the scope."""
+        topics = {
+            SCOPE: "scope_body/pose",
+            parameters.reference_body: "reference_body/pose",
+            parameters.scope_turn_body: "scope_turn_body/pose",
+        }
         for name, topic in topics.items():
+            if not name:
+                continue
             self.create_subscription(
                 PoseStamped, topic, partial(self.on_message, partial(source.put, name)), TRACKER_QOS
             )
@@ -108,11 +117,18 @@ class TrackingNode(BaseNode):
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
         source = self._feed.status()
-        refused = {
+        refused: dict[str, object] = {
             f"refused: {reason}": count for reason, count in dict(self._tracker.validity.counts).items()
         }
         words = f"{accepted} poses in the last second" if source.ok else source.words
-        counts = {"accepted": self._tracker.accepted_count, **source.values, **refused}
+        counts: dict[str, object] = {
+            "calibration": hash_or_none(self._tracker.calibration),
+            "accepted": self._tracker.accepted_count,
+            **source.values,
+            **refused,
+        }
+        if self._tracker.parameters.scope_turn_body:
+            counts["turn of the scope [rad]"] = self._tracker.turn
         return source.ok and accepted > 0, words, counts
 
 

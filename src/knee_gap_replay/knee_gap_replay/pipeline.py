@@ -6,11 +6,13 @@ What passes from core to core passes as messages, as it does between the nodes.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
+from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import GapEdges
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.messages_tracking import fill_lens_pose
+from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration
 from knee_gap_perception.optitrack.body_source import choose_body
 from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
@@ -19,6 +21,7 @@ from knee_gap_perception.pose_validity import ValidityParameters
 from knee_gap_perception.poses import LensPose
 from knee_gap_perception.segmentation_parameters import PoseParameters
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_replay.errors import BagError
 from knee_gap_replay.parameters_file import ParametersFile
 from knee_gap_replay.processing import Output
 from knee_gap_replay.qos import QosName
@@ -35,8 +38,14 @@ _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
-    "segmentation_node": (EdgeParameters, PoseParameters),
-    "tracking_node": (TrackingParameters, ValidityParameters, SourceParameters, NatNetParameters),
+    "segmentation_node": (EdgeParameters, PoseParameters, CalibrationParameters),
+    "tracking_node": (
+        TrackingParameters,
+        ValidityParameters,
+        CalibrationParameters,
+        SourceParameters,
+        NatNetParameters,
+    ),
     "uncertainty_node": (EstimatorParameters, AdviceParameters),
 }
 
@@ -57,10 +66,16 @@ class GapPipeline:
         """
         file.refuse_unknown(PARAMETERS)
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
-        tracking, validity, source, _ = built["tracking_node"]
+        edges, poses, calibration_of_camera = built["segmentation_node"]
+        tracking, validity, calibration_of_lens, source, _ = built["tracking_node"]
+        try:
+            stream = EdgeStream(edges, poses, calibration_of_camera.load())
+            tracker = ScopeTracker(tracking, validity, calibration_of_lens.load())
+        except PerceptionError as error:
+            raise BagError(str(error)) from None
         return cls(
-            EdgeStream(*built["segmentation_node"]),
-            ScopeTracker(tracking, validity),
+            stream,
+            tracker,
             GapEstimator(*built["uncertainty_node"]),
             topics,
             space,
@@ -82,15 +97,25 @@ class GapPipeline:
         self._detector = detector
         self._tracker = tracker
         # A bag holds topics; what came straight from Motive was recorded as the pose of the lens.
-        reference = tracker.parameters.reference_body
         self._body_names = {topics.body_pose: SCOPE}
-        if reference:
-            self._body_names[f"{space}/reference_body/pose"] = reference
+        for topic, name in (
+            ("reference_body/pose", tracker.parameters.reference_body),
+            ("scope_turn_body/pose", tracker.parameters.scope_turn_body),
+        ):
+            if name:
+                self._body_names[f"{space}/{topic}"] = name
         self._bodies = PoseTopics([*self._body_names.values()], up_axis=up_axis)
         self._estimator = estimator
         self._topics = topics
         self._space = space
         self._with_mask = with_mask
+        # What the nodes say of their calibrations at their start; in a bag only where there is one.
+        used = {"segmentation_node": detector.calibration, "tracking_node": tracker.calibration}
+        self._calibrations = [
+            fill_scope_calibration(blank("knee_gap_msgs/msg/ScopeCalibration"), node, calibration)
+            for node, calibration in used.items()
+            if any(used.values())
+        ]
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still where they run backwards.
         self._now_ns = 0
@@ -103,6 +128,11 @@ class GapPipeline:
             self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
             **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
         }
+        if self._calibrations:
+            self.outputs = {
+                **self.outputs,
+                self._topic("scope_calibration"): ("knee_gap_msgs/msg/ScopeCalibration", "latched"),
+            }
         if with_mask:
             self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
@@ -110,6 +140,8 @@ class GapPipeline:
         """Take an image, a camera model or a pose of the tracked body; return what is published then."""
         if self._newest_stamp_ns is not None:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
+        else:
+            yield from self._told_calibrations(stamp_ns)
         self._newest_stamp_ns = stamp_ns
         # Before the message is taken: what it could not wait for any longer is without it, as live.
         yield from self._looked_at(self._detector.ready(self._now_ns))
@@ -123,11 +155,21 @@ class GapPipeline:
             self._detector.on_image(message, self._now_ns)
         yield from self._looked_at(self._detector.ready(self._now_ns))
 
+    def flaws(self) -> list[str]:
+        """What about the calibration kept all results from being valid, a line each."""
+        size = self._detector.size_flaw
+        return [flaw for flaw in (self._estimator.calibration_flaw, size) if flaw]
+
     def finish(self) -> Iterable[Output]:
         """Return the edges and estimates of images whose lens pose will not come any more."""
         yield from self._looked_at(self._detector.finish())
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
         yield from self._published(self._estimator.advance(self._now_ns + wait_ns + 1))
+
+    def _told_calibrations(self, stamp_ns: int) -> Iterator[Output]:
+        for told in self._calibrations:
+            self._estimator.add_calibration(messages.calibration_from_message(told))
+            yield Output(self._topic("scope_calibration"), told, stamp_ns)
 
     def _on_body_pose(self, name: str, message: Any) -> Iterator[Output]:
         self._bodies.put(name, message)

@@ -37,6 +37,8 @@ def _run(arguments: argparse.Namespace) -> int:
         reader.messages(pipeline.inputs)  # refuses a bag without them before anything is written
         with BagWriter(arguments.out, metadata=reader.metadata) as writer:
             counts = process(reader, writer, pipeline)
+    for flaw in pipeline.flaws():
+        print(f"process: {flaw}")
     told = ", ".join(f"{count} {topic}" for topic, count in counts.items())
     print(f"process: {told} in {arguments.out}")
     return 0

@@ -14,6 +14,7 @@ from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
 from knee_gap_uncertainty.track import Track
 
 NANOSECONDS = 1_000_000_000
@@ -50,6 +51,9 @@ class GapEstimator:
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
+        self.calibrations: dict[str, ScopeCalibration] = {}
+        self.calibration_flaw = ""
+        self._calibration_error: CalibrationError | None = None
         self._frame_id = ""
         self._last_edges: Pending | None = None
         self._silence_told_ns = 0
@@ -69,6 +73,17 @@ class GapEstimator:
         else:
             self._frame_id = pose.frame_id
         return self._resolve(arrival_ns)
+
+    def add_calibration(self, told: ScopeCalibration) -> None:
+        """Take what a node says of its calibration; where nodes contradict each other nothing is valid."""
+        known = self.calibrations.get(told.node)
+        self.calibrations[told.node] = told
+        self.calibration_flaw = contradiction(self.calibrations)
+        errors = [one.error for one in self.calibrations.values()]
+        self._calibration_error = next((error for error in errors if error is not None), None)
+        if known is None or known.hash != told.hash:
+            # Views by another calibration are not comparable with those before.
+            self._track = None
 
     def add_edges(self, edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
         """Take the edges of one image; return the estimates that are ready."""
@@ -141,8 +156,11 @@ class GapEstimator:
 
     def _measure(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Estimate from the edges and their lens pose, within the track that they belong to."""
+        if self.calibration_flaw:
+            self._track = None
+            return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, self.calibration_flaw)
         if self._track is None or not self._track.continues_with(edges, pose):
-            self._track = Track(edges.track_id, pose.frame_id, self.parameters)
+            self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
         estimate = self._track.add(edges, pose)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))

@@ -7,6 +7,7 @@ import numpy as np
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.scope_calibration import ScopeCalibration
 
 VALID_EDGES = 1
 TARGETS = {"snr": 0, "width": 1}
@@ -44,6 +45,16 @@ def pose_from_message(message: Any) -> LensPose:
         position=np.array([p.x, p.y, p.z], dtype=float),
         quaternion_xyzw=np.array([q.x, q.y, q.z, q.w], dtype=float),
         covariance=np.array(message.pose.covariance, dtype=float).reshape(6, 6),
+    )
+
+
+def calibration_from_message(message: Any) -> ScopeCalibration:
+    """What a knee_gap_msgs/ScopeCalibration says."""
+    return ScopeCalibration(
+        node=str(message.node),
+        hash=str(message.hash),
+        lens_covariance=np.array(message.lens_covariance, dtype=float).reshape(6, 6),
+        time_offset_error=float(message.time_offset_error),
     )
 
 

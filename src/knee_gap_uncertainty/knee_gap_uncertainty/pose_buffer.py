@@ -2,7 +2,7 @@
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite
 
@@ -21,6 +21,7 @@ class LensPose:
 
     `position` (3,) [m] and `quaternion_xyzw` (4,) map lens coordinates to `frame_id`; `covariance` (6, 6) is
     in the order x, y, z [m^2], rotation about the fixed axes x, y, z of `frame_id` [rad^2] (REP-103).
+    `motion` (6,) is the velocity [m/s] and the turning about the same axes [rad/s], NaN where not known.
     """
 
     stamp_ns: int
@@ -28,6 +29,7 @@ class LensPose:
     position: Array
     quaternion_xyzw: Array
     covariance: Array
+    motion: Array = field(default_factory=lambda: np.full(6, np.nan))
 
 
 class PoseRefusal(StrEnum):
@@ -111,7 +113,8 @@ class PoseBuffer:
         index = bisect_left(self._poses, stamp_ns, key=lambda pose: pose.stamp_ns)
         after = self._poses[index]
         if after.stamp_ns == stamp_ns:
-            return after
+            around = self._poses[index - 1] if index else self._poses[min(1, len(self._poses) - 1)]
+            return replace(after, motion=_motion(around, after))
         before = self._poses[index - 1]
         age = round(self.max_pose_age * 1e9)
         if stamp_ns - before.stamp_ns > age or after.stamp_ns - stamp_ns > age:
@@ -134,7 +137,17 @@ class PoseBuffer:
             position=(1.0 - share) * before.position + share * after.position,
             quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
             covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
+            motion=_motion(before, after),
         )
+
+
+def _motion(one: LensPose, other: LensPose) -> Array:
+    """Velocity and turning (6,) between two poses; NaN between a pose and itself."""
+    seconds = (other.stamp_ns - one.stamp_ns) / 1e9
+    if not seconds:
+        return np.full(6, np.nan)
+    turn = Rotation.from_quat(other.quaternion_xyzw) * Rotation.from_quat(one.quaternion_xyzw).inv()
+    return np.asarray(np.concatenate([other.position - one.position, turn.as_rotvec()]) / seconds)
 
 
 def _refusal(pose: LensPose) -> PoseRefusal | None:

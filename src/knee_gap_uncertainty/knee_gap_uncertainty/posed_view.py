@@ -50,5 +50,6 @@ def posed_view(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> 
             lens_covariances=translation[None],
             rotation_covariances=turn[None],
             lens_rotations=matrix[None],
+            lens_motions=np.nan_to_num(pose.motion)[None],
         ),
     )

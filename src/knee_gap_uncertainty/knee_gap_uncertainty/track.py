@@ -22,6 +22,7 @@ from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
+from knee_gap_uncertainty.scope_calibration import CalibrationError
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
@@ -58,7 +59,14 @@ class AllViews(NamedTuple):
 class Track:
     """Keeps the first view as A0 for the bounds, and views from all along the way for the estimate."""
 
-    def __init__(self, track_id: int, frame_id: str, parameters: EstimatorParameters) -> None:
+    def __init__(
+        self,
+        track_id: int,
+        frame_id: str,
+        parameters: EstimatorParameters,
+        calibration: CalibrationError | None = None,
+    ) -> None:
+        self._calibration = calibration
         self.track_id = track_id
         self.frame_id = frame_id
         self._parameters = parameters
@@ -102,6 +110,8 @@ class Track:
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
             return self._told(blank, view, flaw)
+        if self._calibration is not None:
+            fitted = self._calibration.widened(fitted, views)
         try:
             interval = confidence_interval(fitted, self._parameters.confidence_level)
             all_views = AllViews(views, fitted, interval)
@@ -148,6 +158,7 @@ class Track:
         assert all_views.views.lens_rotations is not None
         if not np.isfinite(all_views.fit.points).all():
             return None
+        angular_error, translation_error = self._error_bounds(self._first, present)
         return Situation(
             stamp_ns=present.stamp_ns,
             frame_id=edges.frame_id,
@@ -157,8 +168,8 @@ class Track:
             rotation=all_views.views.lens_rotations[-1],
             points=all_views.fit.points,
             direction=self._direction,
-            angular_error=max(self._first.angular_error, present.angular_error),
-            translation_error=max(self._first.translation_error, present.translation_error),
+            angular_error=angular_error,
+            translation_error=translation_error,
             interval=self._parameters.interval,
             apex=self._parameters.apex,
             confidence_level=self._parameters.confidence_level,
@@ -167,18 +178,28 @@ class Track:
 
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
         """Bounds from the first and the present view, and the smaller parallax of the two points [rad]."""
+        angular_error, translation_error = self._error_bounds(first, present)
         bounds = gap_range(
             first.lens,
             present.lens,
             first.bearings,
             present.bearings,
-            angular_error=max(first.angular_error, present.angular_error),
-            translation_error=max(first.translation_error, present.translation_error),
+            angular_error=angular_error,
+            translation_error=translation_error,
             interval=self._parameters.interval,
             apex=self._parameters.apex,
         )
         views = two_views(first.lens, present.lens, first.bearings, present.bearings)
         return bounds, float(np.min(triangulate(views).gamma))
+
+    def _error_bounds(self, first: PosedView, present: PosedView) -> tuple[float, float]:
+        """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
+        angle = max(first.angular_error, present.angular_error)
+        position = max(first.translation_error, present.translation_error)
+        if self._calibration is None:
+            return angle, position
+        shared = self._calibration.bounds(first, present, self._parameters.tracker_bound)
+        return angle + shared[0], position + shared[1]
 
     def _measured(
         self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews

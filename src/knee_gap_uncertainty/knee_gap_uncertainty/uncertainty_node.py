@@ -7,8 +7,8 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice
-from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
+from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration
+from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
@@ -42,6 +42,11 @@ class UncertaintyNode(BaseNode):
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
+        # Latched by two nodes: of each the last word is wanted.
+        calibration_qos = QoSProfile(
+            depth=8, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability
+        )
+        self.create_subscription(ScopeCalibration, "scope_calibration", self.on_calibration, calibration_qos)
         self._tick = self.create_timer(TICK, self.on_tick)
 
     def on_tick(self) -> None:
@@ -60,6 +65,12 @@ class UncertaintyNode(BaseNode):
         """Take a lens pose, which may complete images that waited for it."""
         self.publish(self._estimator.add_pose(messages.pose_from_message(message), self.now_ns()))
 
+    def on_calibration(self, message: ScopeCalibration) -> None:
+        """Take what a node says of its calibration of the scope."""
+        self._estimator.add_calibration(messages.calibration_from_message(message))
+        if flaw := self._estimator.calibration_flaw:
+            self.get_logger().error(flaw)
+
     def now_ns(self) -> int:
         """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""
         return int(self.get_clock().now().nanoseconds)
@@ -76,11 +87,15 @@ class UncertaintyNode(BaseNode):
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""
-        latest = self._estimator.latest
+        latest, told = self._estimator.latest, self._estimator.calibrations
+        counts: dict[str, object] = {
+            f"calibration of {node}": calibration.hash or "none" for node, calibration in told.items()
+        }
+        counts.update(self._estimator.counts)
         if latest is None:
-            return False, "no edges received yet", {}
+            return False, self._estimator.calibration_flaw or "no edges received yet", counts
         well = latest.status is gap_estimate.GapStatus.VALID
-        return well, latest.reason or latest.status.name, self._estimator.counts
+        return well, latest.reason or latest.status.name, counts
 
 
 def main(argv: Sequence[str] | None = None) -> int:

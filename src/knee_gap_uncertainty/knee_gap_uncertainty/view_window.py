@@ -58,6 +58,7 @@ class ViewWindow:
         if not self._views:
             raise BadInputError("the window is empty: add a view first")
         rotations = [view.lens_rotations for view in self._views if view.lens_rotations is not None]
+        motions = [view.lens_motions for view in self._views if view.lens_motions is not None]
         return Views(
             lens_positions=np.concatenate([view.lens_positions for view in self._views]),
             bearings=np.concatenate([view.bearings for view in self._views]),
@@ -66,6 +67,7 @@ class ViewWindow:
             rotation_covariances=np.concatenate([view.rotation_covariances for view in self._views]),
             common_share=common_share,
             lens_rotations=np.concatenate(rotations) if len(rotations) == len(self._views) else None,
+            lens_motions=np.concatenate(motions) if len(motions) == len(self._views) else None,
         )
 
     def _is_apart(self, view: Views, others: list[Views]) -> bool:

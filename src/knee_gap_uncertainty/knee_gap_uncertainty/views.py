@@ -28,7 +28,8 @@ class Views:
     share of the bearings' variance that is one and the same offset in all images, in the axes of the image.
     `lens_rotations` (N, 3, 3) takes lens coordinates (z optical axis, x right, y down) to the frame of the
     points and so says which way those axes lie; without it the lens is taken to look at the middle of the gap
-    and not to roll.
+    and not to roll. `lens_motions` (N, 6) are its velocity [m/s] and turning [rad/s] in the frame of the
+    points, by which the error of a clock moves it; None where they are not known.
 
     Raises BadInputError for the first value that breaks a rule.
     """
@@ -40,6 +41,7 @@ class Views:
     rotation_covariances: Array
     common_share: float = 0.5
     lens_rotations: Array | None = None
+    lens_motions: Array | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into contiguous float64 and check them."""
@@ -73,6 +75,8 @@ class Views:
                 self, "lens_rotations", np.ascontiguousarray(self.lens_rotations, dtype=np.float64)
             )
             _check_rotations(self.lens_rotations, count)
+        if self.lens_motions is not None:
+            _check_shape("lens_motions", self.lens_motions, (count, 6))
         _check_covariance("bearing_covariances", self.bearing_covariances)
         _check_covariance("lens_covariances", self.lens_covariances)
         _check_covariance("rotation_covariances", self.rotation_covariances)
@@ -88,6 +92,7 @@ class Views:
     def joined(self, other: "Views") -> "Views":
         """These views and then `other`'s, with the common share of these."""
         rotations = (self.lens_rotations, other.lens_rotations)
+        motions = (self.lens_motions, other.lens_motions)
         return Views(
             lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
             bearings=np.concatenate([self.bearings, other.bearings]),
@@ -98,6 +103,9 @@ class Views:
             lens_rotations=None
             if rotations[0] is None or rotations[1] is None
             else np.concatenate([rotations[0], rotations[1]]),
+            lens_motions=None
+            if motions[0] is None or motions[1] is None
+            else np.concatenate([motions[0], motions[1]]),
         )
 
     def __len__(self) -> int:

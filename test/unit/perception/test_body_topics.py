@@ -155,7 +155,7 @@ class TestRigidBodies:
 
 class TestScopeFeed:
     def test_pose_topics_with_a_leg(self):
-        feed = ScopeFeed(SourceParameters(), reference_body="tibia")
+        feed = ScopeFeed(SourceParameters(), other_bodies=("tibia",))
         for name in ("scope", "tibia"):
             feed.source.put(name, stamped(5 * MILLISECOND))
         ((body, others),) = feed.poll()

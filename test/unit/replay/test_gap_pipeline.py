@@ -42,6 +42,7 @@ class TrueEdges:
 
     def __init__(self) -> None:
         self.camera_seen = False
+        self.calibration = None
         self.images: list[Any] = []
         self.pose_stamps: list[int] = []
 

@@ -1,7 +1,7 @@
 """The tracked scope from whichever source a lab has, and what is wrong when it does not come."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from knee_gap_perception.optitrack.body_source import BodySource, SourceStatus, UnknownBodyError, choose_body
@@ -67,7 +67,7 @@ class ScopeFeed:
         parameters: SourceParameters | None = None,
         natnet: NatNetParameters | None = None,
         *,
-        reference_body: str = "",
+        other_bodies: Sequence[str] = (),
         ros_now: Callable[[], int] = time.time_ns,
     ) -> None:
         self.parameters = parameters or SourceParameters()
@@ -79,7 +79,7 @@ class ScopeFeed:
         elif self.parameters.source == "rigid_bodies":
             self.source = RigidBodiesTopic(up_axis=up_axis)
         else:
-            self.source = PoseTopics([SCOPE, reference_body] if reference_body else [SCOPE], up_axis=up_axis)
+            self.source = PoseTopics([SCOPE, *other_bodies], up_axis=up_axis)
             self._wanted = SCOPE
         self._fault = ""
 

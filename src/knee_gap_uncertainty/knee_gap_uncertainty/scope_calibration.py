@@ -1,0 +1,150 @@
+"""What the calibration of the scope does to a gap: an error that all views of a track share.
+
+A shift of the lens on its body is felt only where the scope turns between the views, a turn of it turns every
+bearing against the travel, and a clock that is off moves the lens along its way. None of it averages out, so
+it is no part of the covariance of a lens pose: it is considered, as the common part of the image's error is.
+The gap's fit is taken as it is, and to its covariance comes what the shared error does to it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.multi_view import MultiViewFit, points_jacobian
+from knee_gap_uncertainty.posed_view import PosedView
+from knee_gap_uncertainty.views import Views
+
+Array = npt.NDArray[np.float64]
+
+HASH_DIGITS = 12  # of a hash, in words
+
+
+@dataclass(frozen=True, eq=False)
+class ScopeCalibration:
+    """What one node says of the calibration that it uses: the fields of knee_gap_msgs/ScopeCalibration.
+
+    `hash` is empty where it uses none. `lens_covariance` (6, 6) is that of a small shift [m^2] and a small
+    rotation [rad^2] of the lens on its body, in the frame of the lens, `time_offset_error` [s] that of the
+    clock; both NaN where the node does not use them.
+    """
+
+    node: str
+    hash: str
+    lens_covariance: Array
+    time_offset_error: float
+
+    @property
+    def error(self) -> "CalibrationError | None":
+        """The error that views share; None where this node has nothing to say of it."""
+        if not np.isfinite(self.lens_covariance).all():
+            return None
+        seconds = self.time_offset_error
+        return CalibrationError(self.lens_covariance, seconds if np.isfinite(seconds) else 0.0)
+
+
+def contradiction(told: dict[str, ScopeCalibration]) -> str:
+    """Why nodes rest on different scopes, in words; empty where they do not."""
+    if len({calibration.hash for calibration in told.values()}) < 2:
+        return ""
+    each = ", ".join(f"{node} {told[node].hash[:HASH_DIGITS] or 'none'}" for node in sorted(told))
+    return f"nodes use different calibrations of the scope: {each}"
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationError:
+    """The shared error: `covariance` (6, 6) and `clock` [s] as in ScopeCalibration."""
+
+    covariance: Array
+    clock: float
+
+    def widened(self, fit: MultiViewFit, views: Views) -> MultiViewFit:
+        """The fit with the shared error in its covariances and in the common part of its shares."""
+        if not np.isfinite(fit.points).all() or views.lens_rotations is None:
+            return fit
+        shift = self._moved_points(fit, views)
+        moved = shift @ self._root()
+        added = moved @ moved.T
+        inverse = np.linalg.inv(points_jacobian(fit.frames, fit.unknowns))
+        before = fit.gap_deviation**2
+        covariance = fit.covariance + added
+        wider = replace(
+            fit,
+            covariance=covariance,
+            unknowns_covariance=fit.unknowns_covariance + inverse @ added @ inverse.T,
+        )
+        after = wider.gap_deviation**2
+        shares = fit.shares * (before / after)
+        shares[3] += 1.0 - before / after
+        return replace(wider, shares=shares)
+
+    def bounds(self, first: PosedView, present: PosedView, factor: float) -> tuple[float, float]:
+        """What the shared error adds to the bounds of an angle [rad] and of a lens position [m], two views.
+
+        `factor` times the RMS length. Half of a difference between the positions counts at either view.
+        """
+        shift, turn = self.covariance[:3, :3], self.covariance[3:, 3:]
+        assert first.view.lens_rotations is not None
+        assert present.view.lens_rotations is not None
+        felt = (present.view.lens_rotations[0] - first.view.lens_rotations[0]) / 2.0
+        motions = [_motions(view.view)[0] for view in (first, present)]
+        late = (motions[1][:3] - motions[0][:3]) / 2.0 * self.clock
+        turned = max(float(motion[3:] @ motion[3:]) for motion in motions) * self.clock**2
+        angle = np.sqrt(np.trace(turn) + turned)
+        position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late)
+        return factor * float(angle), factor * float(position)
+
+    def _root(self) -> Array:
+        """(7, 7) whose product with its transpose is the covariance of shift, rotation and clock."""
+        root = np.zeros((7, 7))
+        values, vectors = np.linalg.eigh(self.covariance)
+        root[:6, :6] = vectors * np.sqrt(np.maximum(values, 0.0))
+        root[6, 6] = self.clock
+        return root
+
+    def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
+        """(6, 7): how far the estimated points go with the shared shift, rotation [rad] and clock [s].
+
+        By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
+        moves all lenses alike moves the points with them, and their distance not at all.
+        """
+        rotations = views.lens_rotations
+        assert rotations is not None
+        motions = _motions(views)
+        moved = np.zeros((6, 7))
+        lens_moved = np.zeros((len(views), 3, 7))
+        lens_moved[:, :, :3] = rotations - rotations[-1]
+        lens_moved[:, :, 6] = motions[:, :3] - motions[-1, :3]
+        turned = np.zeros((len(views), 3, 7))
+        turned[:, :, 3:6] = rotations
+        turned[:, :, 6] = motions[:, 3:]
+        lens_variance = np.trace(views.lens_covariances, axis1=1, axis2=2) / 3.0
+        rotation_variance = np.trace(views.rotation_covariances, axis1=1, axis2=2) / 3.0
+        for n in range(2):
+            used = fit.used[:, n]
+            ray = fit.points[n] - views.lens_positions[used]
+            length = np.linalg.norm(ray, axis=1)
+            bearing = ray / length[:, None]
+            across = np.eye(3) - bearing[:, :, None] * bearing[:, None, :]
+            image_variance = np.trace(views.bearing_covariances[used, n], axis1=1, axis2=2) / 2.0
+            variance = image_variance + rotation_variance[used] + lens_variance[used] / length**2
+            weight = 1.0 / (variance * length**2)
+            # A lens that moves takes its ray along; a bearing b that turns by r goes by r x b.
+            aside = lens_moved[used] - length[:, None, None] * (_cross(bearing) @ turned[used])
+            normal = np.einsum("i,ijk->jk", weight, across)
+            right = np.einsum("i,ijk,ikl->jl", weight, across, aside)
+            moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
+        return moved
+
+
+def _motions(views: Views) -> Array:
+    """(N, 6) velocity [m/s] and turning [rad/s] of the lens; zero where it is not known."""
+    return np.zeros((len(views), 6)) if views.lens_motions is None else views.lens_motions
+
+
+def _cross(vectors: Array) -> Array:
+    """(N, 3, 3) matrices whose product with v is the cross product with v."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x
+    return matrices - np.swapaxes(matrices, 1, 2)
