@@ -9,6 +9,7 @@ import numpy.typing as npt
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
 UNIT_TOLERANCE = 1e-6
+ROUNDING = 1e-6
 
 
 class GapStatus(IntEnum):
@@ -58,6 +59,9 @@ class EdgeObservation:
             return "the edges say valid and carry bearings that are no unit vectors"
         if not 0.0 <= self.angular_error < np.pi / 2:
             return "the edges say valid and carry an angular error outside [0, pi/2)"
+        if self.angular_error < (1.0 - ROUNDING) * np.sqrt(np.linalg.eigvalsh(self.covariances).max()):
+            # No error that is bounded has a standard deviation above its bound.
+            return "the edges say valid and carry an angular error below its own standard deviation"
         return ""
 
 

@@ -15,6 +15,10 @@ from knee_gap_uncertainty.errors import BadInputError
 Array = npt.NDArray[np.float64]
 
 
+# A tracker that measures does not give the same numbers to the last bit so often in a row.
+FROZEN_REPEATS = 10
+
+
 @dataclass(frozen=True, eq=False)
 class LensPose:
     """Pose of the lens at a stamp, with its error: the fields of geometry_msgs/PoseWithCovarianceStamped.
@@ -38,6 +42,7 @@ class PoseRefusal(StrEnum):
     NOT_FINITE = "the lens pose has numbers that are NaN or infinite"
     NOT_UNIT = "the lens pose's quaternion is not of length 1"
     DUPLICATE = "the lens pose has the stamp of the one before it"
+    FROZEN = "the lens pose repeats an old one bit by bit under new stamps"
     NOT_YET = "no lens pose follows the stamp yet"
     TOO_OLD = "the stamp is before the first lens pose that is kept"
     GAP = "a lens pose around the stamp is further from it than max_pose_age"
@@ -71,6 +76,8 @@ class PoseBuffer:
                 raise BadInputError(f"{name} must be finite and not negative, not {value}")
         self.max_pose_age = max_pose_age
         self.reset_count = 0
+        # Poses in a row that repeated the one before them.
+        self._repeats = 0
         self._acceleration = acceleration
         self._angular_acceleration = angular_acceleration
         self._poses: deque[LensPose] = deque(maxlen=capacity)
@@ -90,7 +97,8 @@ class PoseBuffer:
     def add(self, pose: LensPose) -> PoseRefusal | None:
         """Keep a pose, or return why not.
 
-        A stamp before the newest one (a bag that starts again) or another frame empties the buffer first.
+        A stamp before the newest one (a bag that starts again) or another frame empties the buffer first. A
+        pose that goes on repeating the one before it to the last bit is no new measurement, whatever its stamp.
         """
         if refusal := _refusal(pose):
             return refusal
@@ -101,6 +109,9 @@ class PoseBuffer:
             if pose.frame_id != newest.frame_id or pose.stamp_ns < newest.stamp_ns:
                 self.clear()
                 self.reset_count += 1
+        self._repeats = self._repeats + 1 if self._poses and _same_place(pose, self._poses[-1]) else 0
+        if self._repeats >= FROZEN_REPEATS:
+            return PoseRefusal.FROZEN
         self._poses.append(pose)
         return None
 
@@ -148,6 +159,13 @@ def _motion(one: LensPose, other: LensPose) -> Array:
         return np.full(6, np.nan)
     turn = Rotation.from_quat(other.quaternion_xyzw) * Rotation.from_quat(one.quaternion_xyzw).inv()
     return np.asarray(np.concatenate([other.position - one.position, turn.as_rotvec()]) / seconds)
+
+
+def _same_place(pose: LensPose, other: LensPose) -> bool:
+    return bool(
+        np.array_equal(pose.position, other.position)
+        and np.array_equal(pose.quaternion_xyzw, other.quaternion_xyzw)
+    )
 
 
 def _refusal(pose: LensPose) -> PoseRefusal | None:

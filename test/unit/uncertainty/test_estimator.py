@@ -84,7 +84,7 @@ def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
 
 
 def test_without_travel_nothing_is_valid_and_no_gap_is_told() -> None:
-    for estimate in run(GapEstimator(), [0.0] * 30):
+    for estimate in run(GapEstimator(), [1e-12 * k for k in range(30)]):
         assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
         assert math.isnan(estimate.gap)
 
@@ -172,6 +172,29 @@ def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
     assert math.isnan(estimate.gap)
     after = run(estimator, [0.006], begin=stamp + FRAME_NS)
     assert after[-1].status is GapStatus.VALID
+
+
+def test_pose_that_is_repeated_under_new_stamps_is_lost_tracking() -> None:
+    """Whoever sends the pose: no old value is taken for a new one while the scope moves on."""
+    estimator = GapEstimator()
+    assert run(estimator, list(np.linspace(0.0, 0.006, 30)))[-1].status is GapStatus.VALID
+    begin = 10**9 + 30 * FRAME_NS
+    frozen = run(estimator, [0.006] * 30, begin=begin) + estimator.advance(begin + 40 * FRAME_NS)
+    assert {e.status for e in frozen[6:]} <= {GapStatus.TRACKING_LOST, GapStatus.NO_EDGES}
+    assert estimator.counts["pose refused: the lens pose repeats an old one bit by bit under new stamps"] >= 40
+    moving = run(estimator, [0.006 - 1e-5 * k for k in range(1, 30)], begin=begin + 41 * FRAME_NS)
+    assert moving[-1].status is GapStatus.VALID
+
+
+def test_bound_below_its_own_standard_deviation_is_refused() -> None:
+    """The worst case of an error whose bound contradicts its covariance would be none."""
+    estimator = GapEstimator()
+    run(estimator, [0.0, 0.003, 0.006])
+    stamp = 10**9 + 3 * FRAME_NS
+    edge = replace(edges(stamp, 0.006), angular_error=np.radians(0.05))
+    (estimate,) = estimator.add_edges(edge, stamp)
+    assert estimate.status is GapStatus.NO_EDGES
+    assert "standard deviation" in estimate.reason
 
 
 def test_rubbish_poses_are_counted_and_not_used() -> None:
