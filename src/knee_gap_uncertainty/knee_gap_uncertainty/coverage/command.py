@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import random
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,6 +15,7 @@ from knee_gap_uncertainty import gap_range, multi_view
 from knee_gap_uncertainty.coverage.measure import batches, measure
 from knee_gap_uncertainty.coverage.plot import save_plot
 from knee_gap_uncertainty.coverage.table import Row, summary, write_csv
+from knee_gap_uncertainty.coverage.unfinished import Unfinished
 
 DEFAULT_RUNS = 100
 FULL_RUNS = 3000
@@ -43,13 +45,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return refuse(f"--processes must be at least 1, got {options.processes}")
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        rows = with_ranges(study(options.runs, options.seed, options.processes))
+        unfinished = Unfinished(options.out, options.runs, options.seed)
+        rows = with_ranges(study(options.runs, options.seed, options.processes, unfinished))
         write_csv(options.out / "coverage.csv", rows)
         save_plot(options.out / "coverage.png", rows)
+        unfinished.remove()
     except OSError as error:
         return refuse(f"cannot write to {options.out}: {error.strerror or error}")
     except KeyboardInterrupt:
-        return refuse("stopped")
+        return refuse("stopped; the same command goes on from here")
     print(f"{len(rows)} cells, {options.runs} runs each, seed {options.seed}")
     print("\n".join(summary(rows)))
     print(f"written: {options.out / 'coverage.csv'}, {options.out / 'coverage.png'}")
@@ -62,20 +66,23 @@ def refuse(reason: str) -> int:
     return 2
 
 
-def study(runs: int, seed: int, processes: int) -> list[Row]:
+def study(runs: int, seed: int, processes: int, unfinished: Unfinished) -> list[Row]:
     """All rows, in the order of the cells whichever process finished first."""
     # Compiled once, before the processes that would all compile at the same time.
     multi_view.warm_up()
     gap_range.warm_up()
-    todo = list(batches())
-    measure(todo[0], 10, seed)
-    found: dict[int, list[Row]] = {}
+    found = unfinished.read()
+    todo = [batch for batch in batches() if batch.number not in found]
+    if todo:
+        measure(todo[0], 10, seed)
+    # In no order, so that what is done of an interrupted study is a fair sample of it.
+    random.Random(seed).shuffle(todo)
     with ProcessPoolExecutor(processes) as pool:
-        # The longest first, so that no core waits for one at the end.
-        order = sorted(todo, key=lambda batch: -batch.cells[0].view_count)
-        futures = {pool.submit(measure, batch, runs, seed): batch for batch in order}
+        futures = {pool.submit(measure, batch, runs, seed): batch for batch in todo}
         for future in _with_progress(as_completed(futures), len(todo)):
-            found[futures[future].number] = future.result()
+            number = futures[future].number
+            found[number] = future.result()
+            unfinished.add(number, found[number])
     return [row for number in sorted(found) for row in found[number]]
 
 
