@@ -89,9 +89,7 @@ def ours(
         own, other = vector(views.bearings_0[n]), vector(views.bearings_1[n])
         cloud = trace_cloud(vector(views.travel), own, other, psi, shifts, SIGNS[signs])
         clouds.append(slice_spokes(cloud.points, cloud.starts))
-    bound, _, _ = cloud_range(
-        views.travel, views.bearings_0, views.bearings_1, psi, shifts, SIGNS[signs]
-    )
+    bound, _, _ = cloud_range(views.travel, views.bearings_0, views.bearings_1, psi, shifts, SIGNS[signs])
     return *extremes(*clouds), bound
 
 

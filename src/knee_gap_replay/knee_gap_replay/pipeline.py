@@ -119,8 +119,10 @@ class GapPipeline:
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still where they run backwards.
         self._now_ns = 0
+        self._leg_body = [f"{space}/leg_body/pose"] if estimator.parameters.leg_motion > 0.0 else []
         # Before an image comes the camera's model, and the pose of the same instant.
-        self.inputs: Sequence[str] = (topics.camera_info, *self._body_names, topics.image)
+        bodies = (*self._leg_body, *self._body_names)
+        self.inputs: Sequence[str] = (topics.camera_info, *bodies, topics.image)
         self.outputs: Mapping[str, tuple[str, QosName]] = {
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
@@ -149,6 +151,8 @@ class GapPipeline:
         yield from self._advice()
         if topic == self._topics.camera_info:
             self._detector.on_camera_info(message)
+        elif topic in self._leg_body:
+            self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
         elif topic in self._body_names:
             yield from self._on_body_pose(self._body_names[topic], message)
         else:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from knee_gap_uncertainty.advice_task import AdviceTask
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.leg_body import LegBody
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
@@ -21,6 +22,7 @@ NANOSECONDS = 1_000_000_000
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
+LEG_MOVED = "the leg body moved"
 
 
 # Advice that nobody has taken yet.
@@ -51,6 +53,9 @@ class GapEstimator:
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
+        self._leg = LegBody(self.parameters.max_pose_age) if self.parameters.leg_motion > 0.0 else None
+        # Where the leg body was when the track began.
+        self._leg_at_first: LensPose | None = None
         self.calibrations: dict[str, ScopeCalibration] = {}
         self.calibration_flaw = ""
         self._calibration_error: CalibrationError | None = None
@@ -73,6 +78,14 @@ class GapEstimator:
         else:
             self._frame_id = pose.frame_id
         return self._resolve(arrival_ns)
+
+    def add_leg_pose(self, pose: LensPose) -> None:
+        """Take a pose of the leg body; it is without effect where `leg_motion` is 0."""
+        if self._leg is None:
+            return
+        refusal = self._leg.add(pose)
+        if refusal is not None:
+            self.counts[f"leg body refused: {refusal.value}"] += 1
 
     def add_calibration(self, told: ScopeCalibration) -> None:
         """Take what a node says of its calibration; where nodes contradict each other nothing is valid."""
@@ -159,11 +172,23 @@ class GapEstimator:
         if self.calibration_flaw:
             self._track = None
             return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, self.calibration_flaw)
-        if self._track is None or not self._track.continues_with(edges, pose):
+        if self._leg is not None and (flaw := self._leg.flaw(edges.stamp_ns, pose.frame_id)):
+            return self._without(edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, flaw)
+        begins = self._track is None or not self._track.continues_with(edges, pose)
+        if self._leg is not None and not begins and self._leg_moved(self._leg, pose):
+            self._track = None
+            return self._without(edges.stamp_ns, GapStatus.JOINT_MOVED, edges.track_id, LEG_MOVED)
+        if self._track is None or begins:
+            self._leg_at_first = self._leg.pose if self._leg is not None else None
             self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
         estimate = self._track.add(edges, pose)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))
+
+    def _leg_moved(self, leg: LegBody, pose: LensPose) -> bool:
+        """Whether the leg body has moved too far within the track, at the place of the lens."""
+        before = self._leg_at_first
+        return before is not None and leg.moved_since(before, pose.position) > self.parameters.leg_motion
 
     def _situation(self) -> Situation | None:
         """What advice can be based on now."""

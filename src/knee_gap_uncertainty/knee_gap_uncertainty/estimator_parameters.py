@@ -68,11 +68,22 @@ class EstimatorParameters:
         },
     )
 
+    leg_motion: float = field(
+        default=0.0,
+        metadata={
+            "description": "how far, at the lens, the body of leg_body/pose may move within a track before "
+            "it ends with JOINT_MOVED; 0 listens to no such body [m]",
+            "range": (0.0, 0.01),
+        },
+    )
+
     def __post_init__(self) -> None:
         """Refuse what no ROS range can: a combination or a value given in code."""
         for name in ("tracker_bound", "max_pose_age", "max_edges_silence"):
             if not getattr(self, name) > 0.0:
                 raise MeasurementError(f"{name} must be above 0, not {getattr(self, name)!r}")
+        if not 0.0 <= self.leg_motion < float("inf"):
+            raise MeasurementError(f"leg_motion must be finite and not negative, not {self.leg_motion!r}")
         if not 0.0 < self.confidence_level < 1.0:
             raise MeasurementError(f"confidence_level must lie in (0, 1), not {self.confidence_level!r}")
         if not 0.0 <= self.common_share <= 1.0:

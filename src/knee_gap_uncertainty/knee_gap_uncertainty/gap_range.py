@@ -23,9 +23,9 @@ LARGEST_ANGULAR_ERROR = math.pi / 2
 # The clouds grow with the square of the radii: 30 hold four million points each.
 MOST_RADII = 30
 # Where the volumes that worst-case clouds sample come nearer than this share of the least distance of the
-# samples, the rings are too wide beside the gap for eight points each to bound it from below, and the distance
-# of the volumes does. Above it what the sampling costs is told by nobody's data (`docs/coverage.md`), and the
-# samples stand, so that the number is the one that the paper's equations give.
+# samples, the rings are too wide beside the gap for eight points each to bound it from below, and the
+# distance of the volumes does. Above it no simulated error passes between the samples (`docs/coverage.md`),
+# and they stand, so that the number is the one that the paper's equations give.
 SPARSE = 0.82
 # The same between the clouds of one lens and of the other.
 FAR_NEARER = 0.5
@@ -36,8 +36,8 @@ class GapRange(NamedTuple):
 
     `gap_max` is infinite, and `snr` zero, where the admitted errors let a point lie at infinity; `gap_min` is
     zero where the clouds of the two points overlap, and in the worst case the distance of the volumes that
-    they sample where that is less than 0.82 of the least distance of the samples. Without any error the bounds
-    are the gap and `snr` is infinite.
+    they sample where that is less than 0.82 of the least distance of the samples. Without any error the
+    bounds are the gap and `snr` is infinite.
     """
 
     gap: float

@@ -48,6 +48,18 @@ def pose_from_message(message: Any) -> LensPose:
     )
 
 
+def leg_pose_from_message(message: Any) -> LensPose:
+    """Pose of the leg body of a geometry_msgs/PoseStamped, which tells no error."""
+    p, q = message.pose.position, message.pose.orientation
+    return LensPose(
+        stamp_ns=stamp_ns(message.header),
+        frame_id=str(message.header.frame_id),
+        position=np.array([p.x, p.y, p.z], dtype=float),
+        quaternion_xyzw=np.array([q.x, q.y, q.z, q.w], dtype=float),
+        covariance=np.zeros((6, 6)),
+    )
+
+
 def calibration_from_message(message: Any) -> ScopeCalibration:
     """What a knee_gap_msgs/ScopeCalibration says."""
     return ScopeCalibration(

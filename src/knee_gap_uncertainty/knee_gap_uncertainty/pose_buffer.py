@@ -98,7 +98,7 @@ class PoseBuffer:
         """Keep a pose, or return why not.
 
         A stamp before the newest one (a bag that starts again) or another frame empties the buffer first. A
-        pose that goes on repeating the one before it to the last bit is no new measurement, whatever its stamp.
+        pose that goes on repeating the one before it to the last bit is no measurement, whatever its stamp.
         """
         if refusal := _refusal(pose):
             return refusal

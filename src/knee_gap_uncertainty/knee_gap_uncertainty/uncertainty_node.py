@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
 from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration
-from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, BaseNode, run
+from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
@@ -42,6 +42,8 @@ class UncertaintyNode(BaseNode):
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
+        if self._estimator.parameters.leg_motion > 0.0:
+            self.create_subscription(PoseStamped, "leg_body/pose", self.on_leg_pose, TRACKER_QOS)
         # Latched by two nodes: of each the last word is wanted.
         calibration_qos = QoSProfile(
             depth=8, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability
@@ -64,6 +66,10 @@ class UncertaintyNode(BaseNode):
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Take a lens pose, which may complete images that waited for it."""
         self.publish(self._estimator.add_pose(messages.pose_from_message(message), self.now_ns()))
+
+    def on_leg_pose(self, message: PoseStamped) -> None:
+        """Take a pose of a body fixed to the leg, which must not move within a track."""
+        self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
 
     def on_calibration(self, message: ScopeCalibration) -> None:
         """Take what a node says of its calibration of the scope."""

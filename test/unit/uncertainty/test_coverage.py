@@ -10,10 +10,12 @@ import pytest
 from knee_gap_uncertainty.coverage import command
 from knee_gap_uncertainty.coverage.bound import bound
 from knee_gap_uncertainty.coverage.cells import ERROR_SETS, SHARES, Cell, Scene, cells
+from knee_gap_uncertainty.coverage.intervals import intervals
 from knee_gap_uncertainty.coverage.measure import Batch, batches, measure
 from knee_gap_uncertainty.coverage.plot import save_plot
 from knee_gap_uncertainty.coverage.table import summary, write_csv
 from knee_gap_uncertainty.coverage.tracks import simulate, true_bearings, true_track
+from knee_gap_uncertainty.coverage.unfinished import Unfinished
 
 CELL = Cell(Scene(0.008, 0.004, 0.003, 45), ERROR_SETS[0], 2, "half", "bounded", "right")
 
@@ -131,3 +133,32 @@ def test_a_place_that_cannot_be_written_is_one_line(
     (tmp_path / "file").write_text("")
     assert command.main(["--out", str(tmp_path / "file" / "below")]) == 2
     assert "coverage: cannot write to" in capsys.readouterr().err
+
+
+def test_an_interrupted_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
+    batch = next(iter(batches()))
+    rows = measure(batch, 10, 5)
+    begun = Unfinished(tmp_path, 10, 5)
+    assert begun.read() == {}
+    begun.add(batch.number, rows)
+    with begun.path.open("a") as file:
+        file.write('[7, [{"depth_mm": 4')
+    (number, again), *more = Unfinished(tmp_path, 10, 5).read().items()
+    assert not more
+    assert number == batch.number
+    assert repr(again) == repr(rows)
+    assert Unfinished(tmp_path, 11, 5).read() == {}
+    begun.remove()
+    assert begun.read() == {}
+
+
+@pytest.mark.parametrize("noise", ["bounded", "gaussian"])
+def test_errors_that_are_all_common_do_not_widen_the_interval(noise: str) -> None:
+    """2 views over a short travel: what of a common error is taken for each bearing's own goes into depth."""
+    scene = Scene(depth=8e-3, gap=12e-3, travel=1e-3, direction_deg=90)
+    cell = Cell(scene, ERROR_SETS[0], view_count=2, share="common", noise=noise, model="right")
+    tracks = simulate(cell, 1000, np.random.default_rng(8))
+    found = intervals(tracks, cell)
+    covered = np.mean((found.lower <= tracks.gap) & (tracks.gap <= found.upper))
+    assert found.accepted.all()
+    assert 0.93 < covered < 0.975

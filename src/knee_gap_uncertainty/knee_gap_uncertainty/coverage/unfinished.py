@@ -1,4 +1,4 @@
-"""A study that was interrupted: the batches that are done, so that the same command goes on where it stopped."""
+"""A study that was interrupted: the batches that are done, from which the same command goes on."""
 
 import json
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ class Unfinished:
         self.path = out / f"unfinished_{runs}_runs_seed_{seed}.jsonl"
 
     def read(self) -> dict[int, list[Row]]:
-        """Rows by the number of the batch; none where nothing was begun. A line cut off counts for nothing."""
+        """Rows by the number of the batch, none where nothing was begun; a line cut off does not count."""
         found: dict[int, list[Row]] = {}
         if not self.path.exists():
             return found
