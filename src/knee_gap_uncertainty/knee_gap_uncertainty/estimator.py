@@ -101,7 +101,12 @@ class GapEstimator:
     def add_edges(self, edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
         """Take the edges of one image; return the estimates that are ready."""
         self._turn_clock(arrival_ns)
-        if self._last_edges is not None and edges.stamp_ns <= self._last_edges.edges.stamp_ns:
+        last = self._last_edges
+        if last is not None and edges.stamp_ns == last.edges.stamp_ns:
+            # The image was answered; its repetition is no new one, nor an end of silence.
+            self.counts["images with the stamp of the one before"] += 1
+            return self._resolve(arrival_ns)
+        if last is not None and edges.stamp_ns < last.edges.stamp_ns:
             self.counts["stamps ran backwards"] += 1
             self._pending.clear()
             self._track = None

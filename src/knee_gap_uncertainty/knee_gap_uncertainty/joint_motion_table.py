@@ -94,6 +94,9 @@ def still_situations() -> Iterator[Situation]:
         for share in (0.0, 0.5, 1.0):
             for bounded in (False, True):
                 yield Situation(travel, common_share=share, bounded=bounded)
+    for deviation_deg in DEVIATIONS_DEG:
+        for travel in ("out", "rest"):
+            yield Situation(travel, radians(deviation_deg), common_share=0.5)
 
 
 def moved_situations() -> Iterator[Situation]:
