@@ -58,12 +58,15 @@ def find_section(
     opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")[:CANDIDATES]
-    rows, columns = np.mgrid[0 : dark.shape[0], 0 : dark.shape[1]]
+    rows, columns = np.ogrid[0 : dark.shape[0], 0 : dark.shape[1]]
     centre_small = (region[0] + 0.5) * scale - 0.5
-    away = np.hypot(columns - centre_small[0], rows - centre_small[1]) / (region[1] * scale)
-    preference = np.where(away <= 1.0, 1.0 - 0.5 * away**2, 0.0)
+    away2 = ((columns - centre_small[0]) ** 2 + (rows - centre_small[1]) ** 2) / (region[1] * scale) ** 2
+    preference = np.where(away2 <= 1.0, 1.0 - 0.5 * away2, 0.0)
     best: tuple[float, Section] | None = None
     for label in order if count > 1 else ():
+        # No disc in it can be larger than itself.
+        if best is not None and np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi) + 1.0 < best[0]:
+            break
         part = (labels == label).astype(np.uint8)
         # The padding keeps discs inside the frame.
         distance = cv2.distanceTransform(
@@ -88,7 +91,7 @@ def find_section(
                 break
             # Tissue is missing on a side here: look elsewhere along the same part.
             radius = max(6.0, float(distance[row + 1, column + 1]))
-            score = np.where(np.hypot(columns - column, rows - row) < radius, 0.0, score)
+            score = np.where((columns - column) ** 2 + (rows - row) ** 2 < radius**2, 0.0, score)
     return best[1] if best is not None else None
 
 
