@@ -224,6 +224,17 @@ class TestResaved:
         with pytest.raises(UnknownBodyError, match="it has: none"):
             take.body("scope")
 
+    @pytest.mark.parametrize("rate", [360.0, 1500.0])
+    def test_times_rounded_to_milliseconds_are_made_exact_again(self, tmp_path, rate):
+        export = Export()
+        export.keys["Export Frame Rate"] = f"{rate:.6f}"
+        lines = export.text([[SEEN, SEEN]] * 30, first_frame=40).split("\r\n")
+        for row in range(7, 37):
+            number, _, *rest = lines[row].split(",")
+            lines[row] = ",".join([number, f"{round(int(number) / rate, 3):.6f}", *rest])
+        take = read_take(written(tmp_path, "\r\n".join(lines)))
+        np.testing.assert_allclose(take.time, np.arange(40, 70) / rate, atol=1e-9)
+
     def test_frames_that_were_dropped_leave_a_hole_in_time(self, tmp_path):
         lines = Export().text([[SEEN, SEEN]] * 6).split("\r\n")
         take = read_take(written(tmp_path, "\r\n".join([*lines[:9], *lines[11:]])))

@@ -31,6 +31,8 @@ Array = npt.NDArray[np.float64]
 METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 EULER_ORDERS = tuple("".join(order) for order in permutations("XYZ"))
 BODY_TYPE = "rigid body"
+# What rounding to a millisecond leaves, and the last digit of a rate over a long take [s].
+ROUNDED_TIME = 0.6e-3
 # Length of a message: a broken file's cells may be of any length and hold line breaks.
 MOST_WORDS = 300
 LABELS = ("type", "name", "id", "parent")
@@ -142,7 +144,8 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
         raise TakeError(f"{path.name}: {shorten(str(error), MOST_WORDS)}") from None
     if not len(cells):
         raise TakeError(f"{path.name}: the take has no frames")
-    time = cells[:, 1]
+    rate = _number(header["Export Frame Rate"]) if header.get("Export Frame Rate") else float("nan")
+    time = _exact_times(cells[:, 1], cells[:, 0], rate)
     backwards = np.flatnonzero(~(np.diff(time) > 0))
     if len(backwards):
         line = first + int(backwards[0]) + 3
@@ -150,9 +153,7 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
     count = header.get("Total Exported Frames", "")
     return Take(
         version=header["Format Version"],
-        rate=_number(header.get("Export Frame Rate", ""))
-        if header.get("Export Frame Rate")
-        else float("nan"),
+        rate=rate,
         start=_start_time(header.get("Capture Start Time", "")),
         start_text=header.get("Capture Start Time", ""),
         exported_count=int(count) if count.isdecimal() else None,
@@ -295,6 +296,14 @@ def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, 
         if not np.isfinite(cells[index, :2]).all():
             raise TakeError(f"line {line}: no frame number and time, but '{row[0]}', '{row[1]}'")
     return cells
+
+
+def _exact_times(time: Array, frame: Array, rate: float) -> Array:
+    """Times [s] by the frames' numbers where those agree: some exports round times to milliseconds."""
+    if not rate > 0.0:
+        return time
+    exact = frame / rate
+    return exact if np.abs(time - exact).max() <= ROUNDED_TIME else time
 
 
 def _without_empty_end(row: list[str]) -> list[str]:
