@@ -42,9 +42,7 @@ def farthest_point(volume: ConeVolume, direction: Vector) -> Vector:
         ray = towards
     elif norm(across) > 0.0:
         side = unit(across)
-        ray = add(
-            scale(math.cos(volume.half_angle), volume.axis), scale(math.sin(volume.half_angle), side)
-        )
+        ray = add(scale(math.cos(volume.half_angle), volume.axis), scale(math.sin(volume.half_angle), side))
     length = volume.longest if dot(ray, towards) > 0.0 else volume.shortest
     return add(scale(length, ray), scale(volume.blur, towards))
 
@@ -60,9 +58,7 @@ def volume_distance(one: ConeVolume, other: ConeVolume) -> float:
     extent = 0.0
     bound = 0.0
     for _ in range(MOST_STEPS):
-        corner = subtract(
-            farthest_point(one, scale(-1.0, closest)), farthest_point(other, closest)
-        )
+        corner = subtract(farthest_point(one, scale(-1.0, closest)), farthest_point(other, closest))
         extent = max(extent, norm(corner))
         ahead = dot(closest, corner)
         if ahead > TOUCHING * extent * norm(closest):
