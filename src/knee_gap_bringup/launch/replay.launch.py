@@ -55,7 +55,8 @@ def start(context: object) -> list[object]:
             package="knee_gap_perception",
             executable="segmentation_node",
             namespace=namespace,
-            parameters=[*parameters, {"image_transport": "compressed"}],
+            # What stands beside a simulated bag is of the tracked body alone.
+            parameters=[*([given] if given else []), {"image_transport": "compressed"}],
         ),
         Node(
             package="knee_gap_perception",

@@ -57,6 +57,7 @@ class EdgeStream:
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
         self.reason = "no image received yet"
+        self.last_refusal = ""
         self._image: Image | None = None
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
@@ -134,6 +135,7 @@ class EdgeStream:
 
     def _look(self, message: Any) -> GapEdges:
         stamp, frame_id = stamp_ns(message.header), str(message.header.frame_id)
+        self._image = None
         try:
             is_compressed = hasattr(message, "format")
             image = image_from_compressed(message) if is_compressed else image_from_message(message)
@@ -149,6 +151,7 @@ class EdgeStream:
             edges = GapEdges.without_points(stamp, frame_id, EdgeStatus.UNKNOWN)
             self.reason = str(error)
         self.latest = edges
+        self.last_refusal = self.reason or self.last_refusal
         self.counts[edges.status.name] += 1
         if edges.pose_used:
             self.counts["with the pose of the lens"] += 1
@@ -172,9 +175,13 @@ class EdgeStream:
             return self._camera_flaw
         return self.detector.choose_near([column, row], self._camera)
 
+    def mask(self) -> Image | None:
+        """Gap of the last image, 255 where it is (h, w); None where that image could not be read."""
+        return None if self._image is None else self.detector.gap_mask(self._image)
+
     def overlay(self) -> Image | None:
-        """The last image with all that was found drawn on it; None before the first."""
-        if self._image is None or self.latest is None:
+        """The last image with all that was found drawn on it; None where it could not be read."""
+        mask = self.mask()
+        if self._image is None or self.latest is None or mask is None:
             return None
-        mask = self.detector.gap_mask()
         return draw_overlay(self._image, self.latest, mask, self.reason, self._camera)

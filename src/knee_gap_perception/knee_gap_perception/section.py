@@ -13,6 +13,7 @@ Mask = npt.NDArray[np.bool_]
 Image = npt.NDArray[np.uint8]
 
 DIRECTIONS = 36  # across the gap, over half a turn
+SMOOTHED = 4  # directions to either side over which widths are levelled
 STEP = 0.5  # [px at working size] between the samples of a ray
 TISSUE_BEYOND = 6  # [px at working size] of tissue that must follow an edge
 CANDIDATES = 4  # dark parts looked at, largest first
@@ -58,12 +59,15 @@ def find_section(
     opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")[:CANDIDATES]
-    rows, columns = np.mgrid[0 : dark.shape[0], 0 : dark.shape[1]]
+    rows, columns = np.ogrid[0 : dark.shape[0], 0 : dark.shape[1]]
     centre_small = (region[0] + 0.5) * scale - 0.5
-    away = np.hypot(columns - centre_small[0], rows - centre_small[1]) / (region[1] * scale)
-    preference = np.where(away <= 1.0, 1.0 - 0.5 * away**2, 0.0)
+    away2 = ((columns - centre_small[0]) ** 2 + (rows - centre_small[1]) ** 2) / (region[1] * scale) ** 2
+    preference = np.where(away2 <= 1.0, 1.0 - 0.8 * away2, 0.0)
     best: tuple[float, Section] | None = None
     for label in order if count > 1 else ():
+        # No disc in it can be larger than itself.
+        if best is not None and np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi) + 1.0 < best[0]:
+            break
         part = (labels == label).astype(np.uint8)
         # The padding keeps discs inside the frame.
         distance = cv2.distanceTransform(
@@ -88,7 +92,7 @@ def find_section(
                 break
             # Tissue is missing on a side here: look elsewhere along the same part.
             radius = max(6.0, float(distance[row + 1, column + 1]))
-            score = np.where(np.hypot(columns - column, rows - row) < radius, 0.0, score)
+            score = np.where((columns - column) ** 2 + (rows - row) ** 2 < radius**2, 0.0, score)
     return best[1] if best is not None else None
 
 
@@ -116,7 +120,7 @@ def _section_through(
     width = reach.sum(axis=1)
     if not np.isfinite(width).any():
         return None
-    narrowest = int(np.nanargmin(width))
+    narrowest = int(np.nanargmin(_smoothed(width)))
     ends = centre + np.array([[-1.0], [1.0]]) * reach[narrowest][:, None] * directions[narrowest]
     levels = _levels(centre, radius, ends, value)
     contrast = (levels[1:] - levels[0]) / np.maximum(levels[1:], 1.0)
@@ -128,6 +132,17 @@ def _section_through(
         levels=levels,
         sharpness=_sharpness(centre, ends, value),
     )
+
+
+def _smoothed(width: Array) -> Array:
+    """Widths over half a turn (n,) levelled over neighbouring directions; NaN stays NaN.
+
+    A nick in an edge makes one direction a little narrower than the direction across the gap.
+    """
+    turns = np.stack([np.roll(width, shift) for shift in range(-SMOOTHED, SMOOTHED + 1)])
+    known = np.isfinite(turns)
+    level = np.where(known, turns, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isfinite(width), level, np.nan)
 
 
 def _sharpness(centre: Array, ends: Array, value: Image) -> Array:

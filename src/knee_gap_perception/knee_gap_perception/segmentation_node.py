@@ -79,12 +79,10 @@ class SegmentationNode(BaseNode):
             self._edges.publish(message)
             if self._stream.reason:
                 self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
-            if self._mask.get_subscription_count():
-                self.publish_picture(self._mask, self._stream.detector.gap_mask(), "mono8", message)
-            if self._overlay.get_subscription_count():
-                overlay = self._stream.overlay()
-                if overlay is not None:
-                    self.publish_picture(self._overlay, overlay, "bgr8", message)
+            if self._mask.get_subscription_count() and (mask := self._stream.mask()) is not None:
+                self.publish_picture(self._mask, mask, "mono8", message)
+            if self._overlay.get_subscription_count() and (drawn := self._stream.overlay()) is not None:
+                self.publish_picture(self._overlay, drawn, "bgr8", message)
         if not self._stream.waiting:
             self._patience.cancel()
         elif self._patience.is_canceled():
@@ -134,10 +132,12 @@ class SegmentationNode(BaseNode):
         self._sequence = number
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """Status of the latest image, and how often each status came."""
+        """Status of the latest image, how often each status came, and why the last one was refused."""
         latest = self._stream.latest
         well = latest is not None and latest.status is EdgeStatus.VALID
-        counts = {**self._stream.counts, "images dropped": self._dropped}
+        counts: dict[str, object] = {**self._stream.counts, "images dropped": self._dropped}
+        counts["last refusal"] = self._stream.last_refusal
+        counts["confidence of the last search"] = self._stream.detector.confidence
         return well, self._stream.reason, {"calibration": hash_or_none(self._stream.calibration), **counts}
 
 

@@ -6,6 +6,9 @@ What passes from core to core passes as messages, as it does between the nodes.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
+import numpy as np
+import numpy.typing as npt
+
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
@@ -192,18 +195,10 @@ class GapPipeline:
         for edges in images:
             edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
             yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
-            if self._with_mask:
-                yield Output(self._topic("gap_mask"), self._mask_message(edges), edges.stamp_ns)
+            if self._with_mask and (mask := self._detector.mask()) is not None:
+                yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)
             observation = messages.edges_from_message(edges_message)
             yield from self._published(self._estimator.add_edges(observation, self._now_ns))
-
-    def _mask_message(self, edges: GapEdges) -> Any:
-        message, mask = blank("sensor_msgs/msg/Image"), self._detector.detector.gap_mask()
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(edges.stamp_ns, NANOSECONDS)
-        message.header.frame_id, message.encoding = edges.frame_id, "mono8"
-        message.height, message.width = mask.shape
-        message.step, message.data = mask.shape[1], mask.ravel()
-        return message
 
     def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
         for estimate in estimates:
@@ -224,3 +219,12 @@ class GapPipeline:
 
     def _topic(self, name: str) -> str:
         return f"{self._space}/{name}"
+
+
+def _mask_message(edges: GapEdges, mask: npt.NDArray[np.uint8]) -> Any:
+    message = blank("sensor_msgs/msg/Image")
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(edges.stamp_ns, NANOSECONDS)
+    message.header.frame_id, message.encoding = edges.frame_id, "mono8"
+    message.height, message.width = mask.shape
+    message.step, message.data = mask.shape[1], mask.ravel()
+    return message

@@ -101,9 +101,9 @@ def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
     nominal, lens = Scope(), Lens()
     scope = replace(
         nominal,
-        shaft_origin=tuple(np.array(nominal.shaft_origin) + rng.uniform(-0.006, 0.006, 3)),
-        shaft_turn=tuple(np.array(nominal.shaft_turn) + rng.uniform(-0.06, 0.06, 3)),
-        oblique_angle=nominal.oblique_angle + rng.uniform(-0.02, 0.02),
+        shaft_origin=tuple((nominal.shaft_origin + rng.uniform(-0.006, 0.006, 3)).tolist()),
+        shaft_turn=tuple((nominal.shaft_turn + rng.uniform(-0.06, 0.06, 3)).tolist()),
+        oblique_angle=nominal.oblique_angle + float(rng.uniform(-0.02, 0.02)),
     )
     lens = replace(
         lens,

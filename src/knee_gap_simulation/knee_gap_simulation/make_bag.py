@@ -12,7 +12,11 @@ from tqdm import tqdm
 
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.bench import FROM_SEED, Bench
-from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
+from knee_gap_simulation.calibration_bag import (
+    CalibrationRecording,
+    calibration_truth,
+    make_calibration_bag,
+)
 from knee_gap_simulation.clocks import image_times, stamp_ns, tracker_times
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import Hardness
@@ -35,7 +39,11 @@ from knee_gap_simulation.truth import SceneTruth
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of the simple scene of two rims. Lengths [m], times [s]."""
+    """A recording of the simple scene of two rims. Lengths [m], times [s].
+
+    `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording; without
+    it they are the nominal ones. `video_delay`: how late images are stamped.
+    """
 
     gap: float = 0.004
     travel: float = 0.008
@@ -44,6 +52,8 @@ class Recording:
     duration_s: float = 6.0
     fps: float = 60.0
     quality: int = 60
+    scope_of: int | None = None
+    video_delay: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.duration_s <= 600.0:
@@ -52,8 +62,11 @@ class Recording:
             raise SimulationError(f"fps must lie in [1, 240] frames a second, not {self.fps:g}")
         if not 1 <= self.quality <= 100:
             raise SimulationError(f"the JPEG quality must lie in [1, 100], not {self.quality}")
-        if self.seed < 0:
-            raise SimulationError(f"the seed must not be negative, but is {self.seed}")
+        for seed in (self.seed, self.scope_of or 0):
+            if seed < 0:
+                raise SimulationError(f"the seed must not be negative, but is {seed}")
+        if not abs(self.video_delay) <= 0.2:
+            raise SimulationError(f"the video's delay must lie in [-0.2, 0.2] s, not {self.video_delay:g} s")
 
 
 def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> SceneTruth:
@@ -64,7 +77,11 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
     """
     scene = RimScene.random(recording.gap, recording.seed)
     motion = HandMotion(travel=recording.travel, depth=recording.depth, seed=recording.seed)
-    truth = SceneTruth(scene, world_from_scene(recording.seed), Lens(), Scope())
+    lens, scope = Lens(), Scope()
+    if recording.scope_of is not None:
+        calibrated = calibration_truth(CalibrationRecording(seed=recording.scope_of))
+        lens, scope = calibrated.lens, calibrated.scope.scope
+    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, scope)
     times = tracker_times(recording.duration_s, recording.fps)
     lenses = truth.T_world_scene @ motion.poses(times.clip(0.0))
     bodies = track_lens(lenses, truth.scope.body_to_lens(), recording.seed)
@@ -116,7 +133,7 @@ def _rim_images(
             image = camera.frame(T_scene_lens, 1.0 / recording.fps)
             told.one_more()
             yield Sample(
-                stamp_ns(time),
+                stamp_ns(time + recording.video_delay),
                 jpeg=jpeg(image, recording.quality),
                 T_world_lens=truth.T_world_scene @ T_scene_lens,
             )
@@ -199,7 +216,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--no-gap", action="store_true", help="a knee that is closed: no gap is to be found")
     parser.add_argument("--calibration", action="store_true", help="a board and pivoting, to calibrate from")
     parser.add_argument(
-        "--video-delay-ms", type=float, help="how late the images to calibrate from are stamped (12)"
+        "--video-delay-ms", type=float, help="how late images are stamped (0; to calibrate from, 12)"
+    )
+    parser.add_argument(
+        "--scope-of", type=int, metavar="SEED", help="the rims seen by the scope of this calibration bag"
     )
     return parser
 
@@ -234,6 +254,8 @@ def _rims(arguments: argparse.Namespace) -> Recording:
         duration_s=defaults.duration_s if arguments.duration_s is None else arguments.duration_s,
         fps=defaults.fps if arguments.fps is None else arguments.fps,
         quality=defaults.quality if arguments.quality is None else arguments.quality,
+        scope_of=arguments.scope_of,
+        video_delay=1e-3 * (arguments.video_delay_ms or 0.0),
     )
 
 
@@ -262,6 +284,7 @@ def _told_times(times: Iterator[float], count: int) -> Iterator[float]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a bag; 0 when it is made."""
     arguments = _parser().parse_args(argv)
+    of_rims = arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
     of_a_knee = arguments.hardness or arguments.no_gap or arguments.travel_direction
     try:
         if arguments.out.exists():
@@ -269,6 +292,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.calibration:
             make_calibration_bag(arguments.out, _calibration(arguments), _told_times)
         elif arguments.level is not None or of_a_knee:
+            if of_rims:
+                raise SimulationError("--scope-of and --video-delay-ms are for the rims, not for a knee")
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))

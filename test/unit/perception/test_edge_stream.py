@@ -217,6 +217,28 @@ def test_a_point_is_chosen_where_there_is_a_gap_and_refused_elsewhere(joint: Any
     np.testing.assert_allclose(chosen.pixels[:, 0], 820.0, atol=110.0)
 
 
+def test_what_cannot_be_read_gives_no_picture_of_an_earlier_image(joint: Any, travel: Any) -> None:
+    made = stream(joint)
+    assert made.mask() is None
+    assert made.overlay() is None
+    made.on_image(image_message(travel[1][0], 0))
+    assert len(list(made.ready())) == 1
+    mask = made.mask()
+    assert mask is not None
+    assert 0.02 < (mask == 255).mean() < 0.5
+    assert made.overlay() is not None
+    cut = image_message(travel[1][1], FRAME_NS)
+    cut.data = cut.data[:1000]
+    made.on_image(cut)
+    (edges,) = made.ready()
+    assert edges.status is EdgeStatus.UNKNOWN
+    assert made.mask() is None
+    assert made.overlay() is None
+    made.on_image(image_message(travel[1][2], 2 * FRAME_NS))
+    assert next(iter(made.ready())).status is EdgeStatus.VALID
+    assert (made.reason, "bytes" in made.last_refusal) == ("", True)
+
+
 def test_the_wait_is_checked() -> None:
     with pytest.raises(PerceptionError, match="max_pose_wait"):
         PoseParameters(max_pose_wait=5.0)

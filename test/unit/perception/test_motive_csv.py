@@ -176,6 +176,71 @@ class TestVarieties:
         assert _start_time(text) is None
 
 
+class TestResaved:
+    """What comes out of a spreadsheet, a script or an old version, and still says all that is needed."""
+
+    def check(self, tmp_path, text):
+        take = read_take(written(tmp_path, text), up_axis="z")
+        assert [body.name for body in take.bodies] == ["scope", "tibia"]
+        np.testing.assert_allclose(take.body("scope").position, [[0.1, 0.2, 0.3]] * 3)
+        assert take.body("tibia").seen.tolist() == [True, False, True]
+        assert np.isnan(take.body("tibia").position[1]).all()
+
+    def test_without_the_row_of_types(self, tmp_path):
+        lines = Export().text(ROWS).split("\r\n")
+        self.check(tmp_path, "\r\n".join(line for line in lines if not line.startswith(",Type")))
+
+    def test_without_ids(self, tmp_path):
+        lines = Export().text(ROWS).split("\r\n")
+        self.check(tmp_path, "\r\n".join(line for line in lines if not line.startswith(",ID")))
+
+    def test_without_names_nothing_is_guessed(self, tmp_path):
+        lines = Export().text(ROWS).split("\r\n")
+        text = "\r\n".join(line for line in lines if not line.startswith(",Name"))
+        with pytest.raises(TakeError, match="the row with the names is missing"):
+            read_take(written(tmp_path, text))
+
+    def test_with_a_separator_at_the_end_of_every_line(self, tmp_path):
+        self.check(tmp_path, "".join(f"{line},,\r\n" for line in Export().text(ROWS).split("\r\n")[:-1]))
+
+    def test_with_old_line_ends(self, tmp_path):
+        self.check(tmp_path, Export(newline="\r").text(ROWS))
+
+    def test_with_quoted_decimal_commas(self, tmp_path):
+        lines = Export().text(ROWS).split("\r\n")
+        quoted = [
+            ",".join(f'"{cell.replace(".", ",")}"' if "." in cell else cell for cell in line.split(","))
+            for line in lines[7:]
+        ]
+        self.check(tmp_path, "\r\n".join([*lines[:7], *quoted]))
+
+    def test_quaternions_that_are_not_called_so(self, tmp_path):
+        self.check(tmp_path, Export().text(ROWS).replace("Rotation Type,Quaternion,", ""))
+
+    def test_markers_only_is_a_take_without_bodies(self, tmp_path):
+        text = Export(bodies=()).text([[], [], []]).replace("Rotation Type,Quaternion,", "")
+        take = read_take(written(tmp_path, text))
+        assert len(take.time) == 3
+        with pytest.raises(UnknownBodyError, match="it has: none"):
+            take.body("scope")
+
+    @pytest.mark.parametrize("rate", [360.0, 1500.0])
+    def test_times_rounded_to_milliseconds_are_made_exact_again(self, tmp_path, rate):
+        export = Export()
+        export.keys["Export Frame Rate"] = f"{rate:.6f}"
+        lines = export.text([[SEEN, SEEN]] * 30, first_frame=40).split("\r\n")
+        for row in range(7, 37):
+            number, _, *rest = lines[row].split(",")
+            lines[row] = ",".join([number, f"{round(int(number) / rate, 3):.6f}", *rest])
+        take = read_take(written(tmp_path, "\r\n".join(lines)))
+        np.testing.assert_allclose(take.time, np.arange(40, 70) / rate, atol=1e-9)
+
+    def test_frames_that_were_dropped_leave_a_hole_in_time(self, tmp_path):
+        lines = Export().text([[SEEN, SEEN]] * 6).split("\r\n")
+        take = read_take(written(tmp_path, "\r\n".join([*lines[:9], *lines[11:]])))
+        np.testing.assert_allclose(np.diff(take.time), [0.01, 0.03, 0.01])
+
+
 class TestMissing:
     def test_empty_cells_are_no_numbers(self, tmp_path):
         body = read_take(written(tmp_path, Export().text(ROWS))).body("tibia")

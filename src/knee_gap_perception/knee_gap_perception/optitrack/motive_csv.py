@@ -31,6 +31,8 @@ Array = npt.NDArray[np.float64]
 METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 EULER_ORDERS = tuple("".join(order) for order in permutations("XYZ"))
 BODY_TYPE = "rigid body"
+# What rounding to a millisecond leaves, and the last digit of a rate over a long take [s].
+ROUNDED_TIME = 0.6e-3
 # Length of a message: a broken file's cells may be of any length and hold line breaks.
 MOST_WORDS = 300
 LABELS = ("type", "name", "id", "parent")
@@ -134,14 +136,16 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
     rows = _rows(path)
     try:
         header, columns, first = _header(rows)
-        order, scale = _rotation_order(header), _metres(header)
+        order, scale = _rotation_order(header, columns), _metres(header)
         needed = [0, 1, *(index for body in columns for index in body.indices)]
-        cells = _cells(rows[first:], first, len(rows[first - 1]), needed, partial=partial)
+        width = max(len(_without_empty_end(row)) for row in rows[1:first])
+        cells = _cells(rows[first:], first, width, needed, partial=partial)
     except TakeError as error:
         raise TakeError(f"{path.name}: {shorten(str(error), MOST_WORDS)}") from None
     if not len(cells):
         raise TakeError(f"{path.name}: the take has no frames")
-    time = cells[:, 1]
+    rate = _number(header["Export Frame Rate"]) if header.get("Export Frame Rate") else float("nan")
+    time = _exact_times(cells[:, 1], cells[:, 0], rate)
     backwards = np.flatnonzero(~(np.diff(time) > 0))
     if len(backwards):
         line = first + int(backwards[0]) + 3
@@ -149,9 +153,7 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
     count = header.get("Total Exported Frames", "")
     return Take(
         version=header["Format Version"],
-        rate=_number(header.get("Export Frame Rate", ""))
-        if header.get("Export Frame Rate")
-        else float("nan"),
+        rate=rate,
         start=_start_time(header.get("Capture Start Time", "")),
         start_text=header.get("Capture Start Time", ""),
         exported_count=int(count) if count.isdecimal() else None,
@@ -167,12 +169,12 @@ def _rows(path: Path) -> list[list[str]]:
     except OSError as error:
         raise TakeError(f"{path}: {error.strerror}") from None
     text = _decoded(data)
-    first_line = text.split("\n", 1)[0]
+    first_line = re.split("[\r\n]", text, maxsplit=1)[0]
     delimiter = max(",;\t", key=first_line.count)
     rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter))
     if not rows or not rows[0] or rows[0][0].strip() != "Format Version":
         raise TakeError(f"{path.name}: no take of Motive: its first line must start with 'Format Version'")
-    if not text.endswith("\n"):
+    if not text.endswith(("\n", "\r")):
         # Motive ends every line; half a number at the end would pass for a whole one.
         rows[-1] = [*rows[-1][:-1], _CUT]
     return [row for row in rows if any(cell.strip() for cell in row)]
@@ -203,14 +205,21 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
     labelled = {
         row[1].strip().lower(): row for row in above if len(row) > 1 and row[1].strip().lower() in LABELS
     }
-    types, names = labelled.get("type", above[0]), labelled.get("name", above[1])
-    ids, kinds, axes = labelled.get("id", above[2]), above[-1], rows[axes_index]
+    kinds, axes = above[-1], rows[axes_index]
+    # Old versions do not say which row is which.
+    types, names, ids = (
+        labelled.get(label, [] if labelled else above[index]) for index, label in enumerate(LABELS[:3])
+    )
+    if not names:
+        raise TakeError("the row with the names is missing: export with header information")
+    turning = {_cell(names, index) for index, kind in enumerate(kinds) if kind.strip().lower() == "rotation"}
     columns: dict[str, dict[str, int]] = {}
     identity: dict[str, str] = {}
     for index in range(2, len(axes)):
-        if _cell(types, index).lower() != BODY_TYPE:
-            continue
         name = _cell(names, index)
+        # Where no row tells the types: what has a rotation is a body.
+        if _cell(types, index).lower() != BODY_TYPE if types else name not in turning:
+            continue
         identity.setdefault(name, _cell(ids, index))
         kind, axis = _cell(kinds, index), _cell(axes, index)
         key = "error" if "error" in kind.lower() else f"{kind.lower()} {axis}"
@@ -236,9 +245,11 @@ def _columns_of(name: str, identity: str, found: dict[str, int]) -> _BodyColumns
     return _BodyColumns(name, identity, rotation, position, found.get("error"))
 
 
-def _rotation_order(header: dict[str, str]) -> str | None:
-    """Order of the Euler angles, None for quaternions."""
+def _rotation_order(header: dict[str, str], bodies: list[_BodyColumns]) -> str | None:
+    """Order of the Euler angles, None for quaternions, which four numbers are whether or not it is said."""
     kind = header.get("Rotation Type", "")
+    if not kind and all(len(body.rotation) == 4 for body in bodies):
+        return None
     if kind.upper() in EULER_ORDERS:
         return kind.upper()
     if kind.lower() != "quaternion":
@@ -262,6 +273,8 @@ def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, 
     cells = np.full((len(rows), width), np.nan)
     for index, row in enumerate(rows):
         line = first + index + 2
+        if len(row) > width and not any(cell.strip() for cell in row[width:]):
+            row = row[:width]
         is_cut = row[-1] == _CUT or len(row) < width
         if is_cut and index == len(rows) - 1:
             if not partial:
@@ -283,6 +296,20 @@ def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, 
         if not np.isfinite(cells[index, :2]).all():
             raise TakeError(f"line {line}: no frame number and time, but '{row[0]}', '{row[1]}'")
     return cells
+
+
+def _exact_times(time: Array, frame: Array, rate: float) -> Array:
+    """Times [s] by the frames' numbers where those agree: some exports round times to milliseconds."""
+    if not rate > 0.0:
+        return time
+    exact = frame / rate
+    return exact if np.abs(time - exact).max() <= ROUNDED_TIME else time
+
+
+def _without_empty_end(row: list[str]) -> list[str]:
+    """The cells up to the last that holds anything."""
+    last = max((index for index, cell in enumerate(row) if cell.strip()), default=-1)
+    return row[: last + 1]
 
 
 def _number(text: str) -> float:

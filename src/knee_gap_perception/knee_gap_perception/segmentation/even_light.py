@@ -15,6 +15,7 @@ from knee_gap_perception.segmentation.strategy import Image, Mask
 from knee_gap_perception.segmentation.three_classes import otsu3
 
 LOG_OFFSET = 12.0  # [grey levels]: the noise of a black gap makes no class of its own
+COARSE = 4  # levels taken as one where strengths are compared
 STRENGTHS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)  # [levels] lost between middle and rim
 
 
@@ -39,14 +40,16 @@ def log_levels(image: Image, offset: float = LOG_OFFSET) -> npt.NDArray[np.float
 def even_light(image: Image, field: Mask) -> EvenLight:
     """Brightness of an image (h, w, 3), evened and classed within a field (h, w), which is not empty."""
     level, away = log_levels(image), _square_of_distance(field)
-    best: tuple[float, EvenLight] | None = None
-    for strength in STRENGTHS:
-        evened = np.asarray(np.clip(level + strength * (away - 0.5), 0.0, 255.0), np.uint8)
-        classes = otsu3(evened[field])
-        if best is None or classes.clearness > best[0]:
-            best = classes.clearness, EvenLight(evened, classes.dark, classes.middle)
-    assert best is not None
-    return best[1]
+    inside, distance = level[field], away[field] - 0.5
+    # Which strength is best can be told from fewer levels, at a fraction of the cost.
+    clearness = [
+        otsu3((np.clip(inside + strength * distance, 0.0, 255.0) / COARSE).astype(np.uint8), 256 // COARSE)[2]
+        for strength in STRENGTHS
+    ]
+    strength = STRENGTHS[int(np.argmax(clearness))]
+    evened = np.asarray(np.clip(level + strength * (away - 0.5), 0.0, 255.0), np.uint8)
+    classes = otsu3(evened[field])
+    return EvenLight(evened, classes.dark, classes.middle)
 
 
 def _square_of_distance(field: Mask) -> npt.NDArray[np.float32]:

@@ -3,6 +3,7 @@
 scikit-image has the same; to load it takes longer than a node may take to start.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -20,14 +21,20 @@ class ThreeClasses(NamedTuple):
     clearness: float
 
 
-def otsu3(values: npt.NDArray[np.uint8]) -> ThreeClasses:
-    """Classes of values (n,), of which there is at least one."""
-    counts = np.bincount(values, minlength=256).astype(np.float64)
+@cache
+def _in_order(levels: int) -> npt.NDArray[np.bool_]:
+    """Pairs (levels, levels) of which the second is the larger."""
+    return np.triu(np.ones((levels, levels), dtype=bool), 1)
+
+
+def otsu3(values: npt.NDArray[np.uint8], levels: int = 256) -> ThreeClasses:
+    """Classes of values (n,) below `levels`, of which there is at least one."""
+    counts = np.bincount(values, minlength=levels).astype(np.float64)
     present = np.flatnonzero(counts)
     if len(present) < 3:
         return ThreeClasses(float(present[0]), float(present[0]), 1.0 if len(present) == 2 else 0.0)
     mass = np.concatenate([[0.0], np.cumsum(counts)])
-    moment = np.concatenate([[0.0], np.cumsum(counts * np.arange(256))])
+    moment = np.concatenate([[0.0], np.cumsum(counts * np.arange(levels))])
     # The variance between the classes is, but for a constant, the sum of moment^2 / mass of each: table[i, j]
     # is that of the class of levels i to j - 1.
     width = mass[None, :] - mass[:, None]
@@ -35,8 +42,8 @@ def otsu3(values: npt.NDArray[np.uint8]) -> ThreeClasses:
         (moment[None, :] - moment[:, None]) ** 2, width, out=np.zeros_like(width), where=width > 0
     )
     between = table[0, :, None] + table + table[:, -1][None, :]
-    between = np.where(np.triu(np.ones_like(between, dtype=bool), 1), between, -1.0)
+    between = np.where(_in_order(len(between)), between, -1.0)
     first, second = np.unravel_index(int(between.argmax()), between.shape)
     constant = moment[-1] ** 2 / mass[-1]
-    whole = float((counts * np.arange(256) ** 2).sum() - constant)
+    whole = float((counts * np.arange(levels) ** 2).sum() - constant)
     return ThreeClasses(float(first - 1), float(second - 1), float(between.max() - constant) / whole)

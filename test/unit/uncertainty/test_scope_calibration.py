@@ -1,0 +1,146 @@
+"""The shared error of a calibration: what a refit with a wrong scope shows, and that no number of views undoes it."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.multi_view import fit
+from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
+from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+
+Array = npt.NDArray[np.float64]
+
+POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
+NOTHING = np.zeros((6, 6))
+
+
+def scope(count: int, turning: float = 0.3, wrong: Array | None = None) -> Views:
+    """Perfect views from a lens that travels 4 mm and turns, as seen with a scope that is `wrong`.
+
+    `wrong` (7,): shift [m] and rotation [rad] of the lens on its body, and of the clock [s].
+    """
+    error = np.zeros(7) if wrong is None else wrong
+    share = np.linspace(0.0, 1.0, count)
+    lens = np.outer(share**2, [0.004, 0.0005, 0.0])
+    motions = np.zeros((count, 6))
+    motions[:, :3] = 0.01 * 2.0 * share[:, None] * [0.4, 0.05, 0.0]
+    motions[:, 3:] = [0.0, 0.2, 0.1]
+    rotations = Rotation.from_rotvec(np.outer(share, [0.4 * turning, turning, 0.2 * turning])).as_matrix()
+    towards = POINTS - lens[:, None]
+    bearings = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    turn = np.einsum("nij,j->ni", rotations, error[3:6]) + motions[:, 3:] * error[6]
+    bearings = np.einsum("nij,nkj->nki", Rotation.from_rotvec(turn).as_matrix(), bearings)
+    shift = np.einsum("nij,j->ni", rotations, error[:3]) + motions[:, :3] * error[6]
+    return Views(
+        lens + shift,
+        bearings,
+        bearing_covariances(bearings, 2e-3),
+        isotropic_covariances(count, 2e-5),
+        isotropic_covariances(count, 1e-4),
+        lens_rotations=rotations,
+        lens_motions=motions,
+    )
+
+
+def spread(covariance: Array, clock: float, views: Views) -> float:
+    """Standard deviation of the gap that the shared error alone gives [m]."""
+    fitted = fit(views)
+    wider = CalibrationError(covariance, clock).widened(fitted, views)
+    return float(np.sqrt(max(wider.gap_deviation**2 - fitted.gap_deviation**2, 0.0)))
+
+
+@pytest.mark.parametrize("axis", range(7))
+def test_it_is_what_a_refit_with_a_wrong_scope_shows(axis: int) -> None:
+    size = [3e-4, 3e-4, 3e-4, 2e-3, 2e-3, 2e-3, 2e-3][axis]
+    wrong = np.zeros(7)
+    wrong[axis] = size
+    shown = abs(fit(scope(20, wrong=wrong)).gap - fit(scope(20, wrong=-wrong)).gap) / 2.0
+    covariance = NOTHING.copy()
+    if axis < 6:
+        covariance[axis, axis] = size**2
+    told = spread(covariance, size if axis == 6 else 0.0, scope(20))
+    assert told == pytest.approx(shown, rel=0.15, abs=2e-6)
+
+
+def test_a_shift_is_not_felt_by_a_scope_that_does_not_turn() -> None:
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0])  # a millimetre
+    assert spread(covariance, 0.0, scope(20, turning=0.0)) < 1e-9
+    assert spread(covariance, 0.0, scope(20, turning=0.3)) > 1e-5
+
+
+def test_it_does_not_average_out() -> None:
+    covariance = np.diag([4e-8, 4e-8, 4e-8, 4e-6, 4e-6, 4e-6])
+    few, many = (spread(covariance, 1e-3, scope(count)) for count in (10, 200))
+    assert many > 0.8 * few
+    assert fit(scope(200)).gap_deviation < 0.8 * fit(scope(10)).gap_deviation
+
+
+def test_it_counts_as_common_and_shares_still_sum_to_one() -> None:
+    views = scope(30)
+    fitted = fit(views)
+    wider = CalibrationError(np.diag([4e-8] * 3 + [1e-4] * 3), 0.0).widened(fitted, views)
+    assert wider.shares.sum() == pytest.approx(1.0)
+    assert wider.shares[3] > fitted.shares[3]
+
+
+def told(node: str, digest: str, *, error: Array | None = None) -> ScopeCalibration:
+    return ScopeCalibration(node, digest, np.full((6, 6), np.nan) if error is None else error, 0.0)
+
+
+def test_nodes_with_different_calibrations_contradict_each_other() -> None:
+    one, other, none = told("tracking_node", "a" * 64), told("segmentation_node", "b" * 64), told("x", "")
+    assert not contradiction({"tracking_node": one})
+    assert not contradiction({"tracking_node": one, "segmentation_node": replace(other, hash="a" * 64)})
+    words = contradiction({"tracking_node": one, "segmentation_node": other})
+    assert "segmentation_node bbbbbbbbbbbb, tracking_node aaaaaaaaaaaa" in words
+    assert "x none" in contradiction({"tracking_node": one, "x": none})
+
+
+def estimates(*calibrations: ScopeCalibration) -> list[GapEstimate]:
+    """What the estimator says of 40 views of the travelling scope."""
+    estimator, views, found = GapEstimator(), scope(40), []
+    for calibration in calibrations:
+        estimator.add_calibration(calibration)
+    assert views.lens_rotations is not None
+    for k in range(40):
+        stamp_ns = 10**18 + k * 10_000_000
+        rotation = views.lens_rotations[k]
+        bearings = views.bearings[k] @ rotation
+        edges = EdgeObservation(
+            stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3
+        )
+        pose = LensPose(
+            stamp_ns,
+            "world",
+            views.lens_positions[k],
+            Rotation.from_matrix(rotation).as_quat(),
+            np.diag([1e-10] * 3 + [1e-9] * 3),
+        )
+        estimator.add_pose(pose, stamp_ns)
+        found += estimator.add_edges(edges, stamp_ns)
+    return found
+
+
+def test_nothing_is_valid_while_the_nodes_contradict_each_other() -> None:
+    same = estimates(told("tracking_node", "a" * 64), told("segmentation_node", "a" * 64))
+    assert any(estimate.status is GapStatus.VALID for estimate in same)
+    different = estimates(told("tracking_node", "a" * 64), told("segmentation_node", ""))
+    assert {estimate.status for estimate in different} == {GapStatus.UNKNOWN}
+    assert "different calibrations" in different[-1].reason
+
+
+def test_both_intervals_include_the_calibrations_error() -> None:
+    without = estimates()[-1]
+    poor = np.diag([1e-8] * 3 + [1e-5] * 3)
+    with_it = estimates(told("tracking_node", "a" * 64, error=poor))[-1]
+    assert with_it.status is without.status is GapStatus.VALID
+    assert with_it.gap == pytest.approx(without.gap)
+    for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
+        assert getattr(with_it, low) < getattr(without, low)
+        assert getattr(with_it, high) > getattr(without, high)
