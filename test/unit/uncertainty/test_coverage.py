@@ -148,6 +148,10 @@ def test_an_interrupted_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
     assert number == batch.number
     assert repr(again) == repr(rows)
     assert Unfinished(tmp_path, 11, 5).read() == {}
+    told = ["--out", str(tmp_path), "--seed", "5", "--so-far", "--runs"]
+    assert command.main([*told, "10"]) == 0
+    assert (tmp_path / "coverage.csv").exists()
+    assert command.main([*told, "11"]) == 2
     begun.remove()
     assert begun.read() == {}
 

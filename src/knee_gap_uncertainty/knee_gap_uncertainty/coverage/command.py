@@ -12,6 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from knee_gap_uncertainty import gap_range, multi_view
+from knee_gap_uncertainty.coverage.cells import cells
 from knee_gap_uncertainty.coverage.measure import batches, measure
 from knee_gap_uncertainty.coverage.plot import save_plot
 from knee_gap_uncertainty.coverage.table import Row, summary, write_csv
@@ -36,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the tracks (1)")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="cores to use (all)")
+    parser.add_argument(
+        "--so-far", action="store_true", help="table, plot and summary of what an interrupted run finished"
+    )
     options = parser.parse_args(argv)
     if not 10 <= options.runs <= MOST_RUNS:
         return refuse(f"--runs must be from 10 to {MOST_RUNS}, got {options.runs}")
@@ -46,15 +50,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         unfinished = Unfinished(options.out, options.runs, options.seed)
-        rows = with_ranges(study(options.runs, options.seed, options.processes, unfinished))
+        if options.so_far:
+            done = unfinished.read()
+            if not done:
+                return refuse(f"nothing was begun in {options.out} with these --runs and --seed")
+            rows = with_ranges([row for number in sorted(done) for row in done[number]])
+        else:
+            rows = with_ranges(study(options.runs, options.seed, options.processes, unfinished))
         write_csv(options.out / "coverage.csv", rows)
         save_plot(options.out / "coverage.png", rows)
-        unfinished.remove()
+        if not options.so_far:
+            unfinished.remove()
     except OSError as error:
         return refuse(f"cannot write to {options.out}: {error.strerror or error}")
     except KeyboardInterrupt:
         return refuse("stopped; the same command goes on from here")
-    print(f"{len(rows)} cells, {options.runs} runs each, seed {options.seed}")
+    of_all = f" of {sum(1 for _ in cells())}" if options.so_far else ""
+    print(f"{len(rows)}{of_all} cells, {options.runs} runs each, seed {options.seed}")
     print("\n".join(summary(rows)))
     print(f"written: {options.out / 'coverage.csv'}, {options.out / 'coverage.png'}")
     return 0
@@ -107,7 +119,7 @@ def with_ranges(rows: Sequence[Row]) -> list[Row]:
         for row in rows
         if row.views == 2 and row.model == "right"
     }
-    return [replace(row, **of_two[tuple(getattr(row, key) for key in keys)]) for row in rows]
+    return [replace(row, **of_two.get(tuple(getattr(row, key) for key in keys), {})) for row in rows]
 
 
 if __name__ == "__main__":
