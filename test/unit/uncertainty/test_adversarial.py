@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.pose_buffer import LensPose
 
@@ -83,6 +84,12 @@ class Scope:
         )
         return self.pose_told(pose, t)
 
+    def leg(self, t: float) -> LensPose:
+        """What the tracker says of a body fixed to the second point."""
+        position = [0.1, 0.0, 0.0] + self.shift(t)[1] + LENS_ERROR / np.sqrt(3) * self.rng.standard_normal(3)
+        turned = Rotation.from_rotvec(ROTATION_ERROR / np.sqrt(3) * self.rng.standard_normal(3))
+        return LensPose(SECOND + round(t * 1e9), "world", position, turned.as_quat(), np.zeros((6, 6)))
+
     def edges(self, t: float) -> EdgeObservation:
         """What the camera says."""
         position, rotation = self.place(t)
@@ -106,6 +113,7 @@ class Scope:
         for k in range(IMAGES):
             for step in range(2):
                 t = (k + 0.5 * step) / 60 + 0.02
+                estimator.add_leg_pose(self.leg(t - 0.006))
                 found += estimator.add_pose(self.pose(t - 0.006), SECOND + round(t * 1e9))
                 if step == 0 and self.seen(t):
                     found += estimator.add_edges(self.edges(t), SECOND + round(t * 1e9))
@@ -187,6 +195,27 @@ def test_point_that_jumps_across_while_no_image_comes(scope: Scope) -> None:
     assert not scope.outside(estimates)
     after = [e for e in estimates if 1.4 < (e.stamp_ns - SECOND) / 1e9 < 1.48]
     assert GapStatus.VALID not in statuses(after)
+
+
+def slips(scope: Scope) -> None:
+    """The second point goes 2 mm a second along its ray, from 0.5 s on."""
+    ray = POINTS[1] / np.linalg.norm(POINTS[1])
+    scope.shift = lambda t: np.array([np.zeros(3), 2e-3 * max(t - 0.5, 0.0) * ray])
+
+
+def test_point_that_slips_along_its_ray_is_told_by_the_leg_body_only() -> None:
+    wrong = [0, 0]
+    for seed in range(6):
+        for watched in (False, True):
+            scope = Scope(np.random.default_rng(seed))
+            slips(scope)
+            parameters = EstimatorParameters(leg_motion=0.5e-3 if watched else 0.0)
+            estimates = scope.estimates(GapEstimator(parameters))
+            wrong[watched] += len(scope.outside(estimates))
+            if watched:
+                assert GapStatus.JOINT_MOVED in statuses(estimates)
+    assert wrong[0] > 0
+    assert wrong[1] == 0
 
 
 def test_edge_that_is_wrong_from_the_start(scope: Scope) -> None:
