@@ -94,3 +94,68 @@ def test_leg_as_reference(tmp_path: Path) -> None:
         client.spin_until(lambda: len(poses) > 40)
         assert {message.header.frame_id for message in poses} == {"tibia"}
         assert [m.pose.pose.position.x for m in poses] == pytest.approx([0.1] * len(poses), abs=1e-4)
+
+
+def told_words(tmp_path: Path, server: list[str], settings: dict[str, str], words: str) -> str:
+    """What diagnostics say once they hold `words`, with a server and settings of tracking_node."""
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        processes.start("server", [executable("knee_gap_simulation", "natnet_server"), *server])
+        node = [executable("knee_gap_perception", "tracking_node"), *NODE, "-p", "source:=natnet"]
+        for name, value in settings.items():
+            node += ["-p", f"{name}:={value}"]
+        processes.start("tracking_node", node)
+        client.listen(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(DiagnosticArray, "/diagnostics")
+        processes.wait_ready(["tracking_node"], 60.0)
+
+        def last() -> str:
+            told = [status.message for array in client.received["/diagnostics"] for status in array.status]
+            return told[-1] if told else ""
+
+        client.spin_until(lambda: words in last(), timeout=30.0)
+        assert not client.received["scope_pose"]
+        assert processes.end("tracking_node") == 0
+        return last()
+
+
+def test_a_body_that_motive_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
+    port = str(free_port())
+    server = ["--command-port", port, "--body", "probe", "--body", "tibia"]
+    told = told_words(tmp_path, server, {"body": "scope", "command_port": port}, "no rigid body 'scope'")
+    assert "'probe' (id 1), 'tibia' (id 2)" in told
+
+
+def test_silence_is_told_with_its_likely_causes(tmp_path: Path) -> None:
+    settings = {"body": "scope", "command_port": str(free_port())}
+    told = told_words(tmp_path, ["--command-port", str(free_port())], settings, "no answer from 127.0.0.1")
+    assert "likely causes: Motive does not run or does not stream" in told
+
+
+def test_a_server_that_shows_no_frames_is_told_from_one_that_is_not_there(tmp_path: Path) -> None:
+    port = str(free_port())
+    server = ["--command-port", port, "--lose", "1.0"]
+    told = told_words(tmp_path, server, {"body": "scope", "command_port": port}, "but no data for")
+    assert told.startswith("connected to Motive")
+    assert "likely causes" in told
+
+
+def test_of_two_servers_one_is_listened_to(tmp_path: Path) -> None:
+    ports = [str(free_port()), str(free_port())]
+    data = str(free_port())
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        for number, (port, name) in enumerate(zip(ports, ("scope", "other"), strict=True)):
+            server = [executable("knee_gap_simulation", "natnet_server"), "--command-port", port]
+            server += ["--multicast", "239.255.42.99", "--data-port", data, "--body", name]
+            processes.start(f"server_{number}", [*server, "--seed", str(number), "--rate", "100"])
+        node = [executable("knee_gap_perception", "tracking_node"), *NODE, "-p", "source:=natnet"]
+        node += ["-p", "body:=scope", "-p", f"command_port:={ports[0]}", "-p", "local_address:=127.0.0.1"]
+        processes.start("tracking_node", node)
+        client.listen(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(DiagnosticArray, "/diagnostics")
+        processes.wait_ready(["tracking_node"], 60.0)
+        poses = client.received["scope_pose"]
+        client.spin_until(lambda: len(poses) > 150, timeout=40.0)
+        stamps = np.array([stamp(message) for message in poses])
+        # Frames of both, one after the other, would run to and fro and be twice as many.
+        assert (np.diff(stamps) > 0.0).all()
+        assert np.median(np.diff(stamps)) == pytest.approx(1 / 100, abs=2e-3)

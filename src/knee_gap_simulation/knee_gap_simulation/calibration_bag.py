@@ -14,10 +14,11 @@ import numpy as np
 
 from knee_gap_replay.bag import BagWriter
 from knee_gap_replay.types import blank
-from knee_gap_simulation.calibration_scene import BoardCamera, ChessBoard, TurnedScope
+from knee_gap_simulation.calibration_scene import Board, BoardCamera, ChessBoard, DotBoard, TurnedScope
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.imaging import jpeg
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.pinhole import PinholeLens
 from knee_gap_simulation.recording import (
     BODY_POSE,
     BODY_POSE_TRUE,
@@ -39,11 +40,16 @@ TRACKER_HZ = 120.0
 TRACKER_PHASE_S = 0.0017
 MARGIN_S = 0.5  # tracked before the first image and after the last
 TIP_BEYOND_LENS = 0.0012  # [m] along the shaft
+BOARDS: dict[str, Board] = {"charuco": ChessBoard(), "dots": DotBoard()}
+LENSES: dict[str, Lens] = {"equidistant": Lens(), "pinhole": PinholeLens()}
 
 
 @dataclass(frozen=True)
 class CalibrationRecording:
-    """What to record. `video_delay` [s]: how late images are stamped, so that the time offset is minus it."""
+    """What to record, with a board of BOARDS and a lens of LENSES.
+
+    `video_delay` [s]: how late images are stamped, so that the time offset is minus it.
+    """
 
     seed: int = 7
     fps: float = 30.0
@@ -53,8 +59,15 @@ class CalibrationRecording:
     video_delay: float = 0.012
     quality: int = 85
     noise: TrackerNoise = field(default_factory=TrackerNoise)
+    board: str = "charuco"
+    lens: str = "equidistant"
 
     def __post_init__(self) -> None:
+        for name, choices in (("board", list(BOARDS)), ("lens", list(LENSES))):
+            if getattr(self, name) not in choices:
+                raise SimulationError(
+                    f"the {name} must be one of {', '.join(choices)}, not {getattr(self, name)}"
+                )
         if self.seed < 0:
             raise SimulationError(f"the seed must not be negative, but is {self.seed}")
         if not 5.0 <= self.fps <= 120.0:
@@ -72,7 +85,7 @@ class CalibrationTruth:
 
     lens: Lens
     scope: TurnedScope
-    board: ChessBoard
+    board: Board
     T_world_board: FloatArray
     tip: FloatArray
     pivot: FloatArray
@@ -98,7 +111,7 @@ class CalibrationTruth:
 def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
     """A scope assembled as the seed has it: lens, body and shaft are never where the drawing says."""
     rng = np.random.default_rng([recording.seed, 0x4341])
-    nominal, lens = Scope(), Lens()
+    nominal, lens = Scope(), LENSES[recording.lens]
     scope = replace(
         nominal,
         shaft_origin=tuple((nominal.shaft_origin + rng.uniform(-0.006, 0.006, 3)).tolist()),
@@ -116,7 +129,7 @@ def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
     return CalibrationTruth(
         lens=lens,
         scope=turned,
-        board=ChessBoard(),
+        board=BOARDS[recording.board],
         T_world_board=transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5])),
         tip=shaft[:3, 3] + TIP_BEYOND_LENS * shaft[:3, 2],
         pivot=rng.uniform([-0.4, 0.8, -0.4], [0.4, 1.1, 0.4]),

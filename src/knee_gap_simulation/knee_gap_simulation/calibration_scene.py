@@ -1,6 +1,7 @@
 """A calibration board on a speckled table, seen by a scope that may be turned in its camera head."""
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,6 +21,65 @@ NOTCH_DEPTH = 0.055  # of the field's radius
 WORKING_DISTANCE = 0.024
 NOISE_FRAMES = 6  # drawn once, then rolled at random: drawing is the slowest part of a picture
 TINT_BGR = (0.86, 0.93, 1.0)
+
+
+class Board(Protocol):
+    """What the scene asks of a board, whose frame has x along its columns, y along its rows [m]."""
+
+    @property
+    def text(self) -> str:
+        """The board as calibration commands take it."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+
+    def texture(self, rng: np.random.Generator) -> tuple[npt.NDArray[np.float32], float, FloatArray]:
+        """Reflectance (h, w), its scale [px/m], and the pixel (2,) of the board's origin."""
+
+
+@dataclass(frozen=True)
+class DotBoard:
+    """OpenCV's asymmetric grid of dots on a white card. Frame: the first dot is the origin; as ChessBoard."""
+
+    columns: int = 4
+    rows: int = 11
+    pitch: float = 0.0013
+    dot: float = 0.0004  # radius
+    card: float = 0.0030  # white around the outer dots
+
+    @property
+    def text(self) -> str:
+        """The board as calibration commands take it."""
+        return f"dots:{self.columns}x{self.rows}:{1e3 * self.pitch:g}"
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m], from the first dot to the last."""
+        return (2 * self.columns - 1) * self.pitch, (self.rows - 1) * self.pitch
+
+    def texture(self, rng: np.random.Generator) -> tuple[npt.NDArray[np.float32], float, FloatArray]:
+        """Reflectance (h, w), its scale [px/m], and the pixel (2,) of the first dot."""
+        scale = float(TEXTURE_PX_PER_M)
+        origin = round((TABLE_MARGIN + self.card) * scale)
+        width, height = (round(side * scale) + 2 * origin for side in self.size)
+        table = _table((height, width), scale, rng)
+        card = slice(round(TABLE_MARGIN * scale), -round(TABLE_MARGIN * scale))
+        table[card, card] = 0.85
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        for row in range(self.rows):
+            for column in range(self.columns):
+                centre = origin + scale * self.pitch * np.array([2 * column + row % 2, row])
+                distance = np.hypot(x - centre[0], y - centre[1])
+                inside = np.clip(self.dot * scale - distance + 0.5, 0.0, 1.0)
+                table += (0.07 - table) * inside
+        return cv2.GaussianBlur(table, (0, 0), 0.7).astype(np.float32), scale, np.full(2, float(origin))
+
+
+def _table(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+    """Speckles of the table's reflectance."""
+    table = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 0.00025 * scale)
+    return np.clip(0.45 + 0.12 * table / table.std(), 0.15, 0.8).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -51,9 +111,7 @@ class ChessBoard:
         width, height = self.columns * per_square, self.rows * per_square
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
-        shape = (height + 2 * margin, width + 2 * margin)
-        table = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 0.00025 * scale)
-        table = np.clip(0.45 + 0.12 * table / table.std(), 0.15, 0.8).astype(np.float32)
+        table = _table((height + 2 * margin, width + 2 * margin), scale, rng)
         ink = board.generateImage((width, height), marginSize=0)
         table[margin : margin + height, margin : margin + width] = np.where(ink > 127, 0.85, 0.07)
         # A pixel of the texture is centred half a pixel from its edge, at which the board begins.
@@ -80,7 +138,7 @@ class TurnedScope:
 class BoardCamera:
     """Pictures of the board through the lens, with its light at the tip, noise and the notch."""
 
-    def __init__(self, board: ChessBoard, lens: Lens, scope: TurnedScope, seed: int) -> None:
+    def __init__(self, board: Board, lens: Lens, scope: TurnedScope, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 0x4243])
         self._texture, self._scale, self._origin = board.texture(self._rng)
         self._lens, self._scope = lens, scope

@@ -13,6 +13,8 @@ from tqdm import tqdm
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.bench import FROM_SEED, Bench
 from knee_gap_simulation.calibration_bag import (
+    BOARDS,
+    LENSES,
     CalibrationRecording,
     calibration_truth,
     make_calibration_bag,
@@ -218,6 +220,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--video-delay-ms", type=float, help="how late images are stamped (0; to calibrate from, 12)"
     )
+    parser.add_argument("--board", choices=BOARDS, help="to calibrate from (charuco)")
+    parser.add_argument("--lens", choices=LENSES, help="to calibrate (equidistant)")
     parser.add_argument(
         "--scope-of", type=int, metavar="SEED", help="the rims seen by the scope of this calibration bag"
     )
@@ -270,6 +274,8 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
         fps=defaults.fps if arguments.fps is None else arguments.fps,
         board_s=defaults.board_s if arguments.duration_s is None else arguments.duration_s,
         video_delay=1e-3 * delay_ms,
+        board=arguments.board or defaults.board,
+        lens=arguments.lens or defaults.lens,
         quality=defaults.quality if arguments.quality is None else arguments.quality,
     )
 
@@ -287,6 +293,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     of_rims = arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
     of_a_knee = arguments.hardness or arguments.no_gap or arguments.travel_direction
     try:
+        if (arguments.board or arguments.lens) and not arguments.calibration:
+            raise SimulationError("--board and --lens are for --calibration")
         if arguments.out.exists():
             raise BagError(f"{arguments.out} exists already; choose another name or remove it")
         if arguments.calibration:
