@@ -17,7 +17,7 @@ from knee_gap_bringup.processes import Processes, executable
 
 DOMAIN = 53
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-NODE = ("--ros-args", "-r", "__ns:=/knee_gap")
+NODE = ("--ros-args", "-r", "__ns:=/knee_gap", "-p", "body_to_shaft_translation:=[0.0, 0.0, 0.0]")
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 

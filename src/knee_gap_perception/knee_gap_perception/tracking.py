@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from math import pi, radians
+from math import isnan, nan, pi, radians
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,8 +40,13 @@ class TrackingParameters:
         metadata={"description": "Name of the optical frame of the lens: z along the view, x right, y down"},
     )
     body_to_shaft_translation: tuple[float, ...] = field(
-        default=(0.0, 0.0, 0.0),
-        metadata={"description": "Position of the lens in the tracked body, x y z [m]", "range": (-2.0, 2.0)},
+        default=(nan, nan, nan),
+        metadata={
+            "description": "Position of the lens in the tracked body, x y z [m]; NaN is not known, and then a "
+            "calibration_file has to tell",
+            "range": (-2.0, 2.0),
+            "nan": True,
+        },
     )
     body_to_shaft_quaternion_xyzw: tuple[float, ...] = field(
         default=(0.0, 0.0, 0.0, 1.0),
@@ -246,13 +251,21 @@ def _fault(
 
 def _refuse_contradictions(parameters: TrackingParameters, calibration: Calibration | None) -> None:
     """Raise PerceptionError where two settings say different things of the lens, or one needs another."""
+    placed = not any(isnan(number) for number in parameters.body_to_shaft_translation)
     if calibration is None:
         if parameters.scope_turn_body:
             raise PerceptionError("scope_turn_body needs a calibration_file that was made with that body")
+        if not placed:
+            raise PerceptionError(
+                "where the lens sits on the tracked body is not known: give calibration_file, or "
+                "body_to_shaft_translation and body_to_shaft_quaternion_xyzw"
+            )
         return
     calibration.require_lens()
     defaults = {field.name: field.default for field in fields(TrackingParameters)}
-    given = [name for name in PLACE_OF_LENS if getattr(parameters, name) != defaults[name]]
+    # NaN, which is not given, is unlike itself.
+    others = [name for name in PLACE_OF_LENS[1:] if getattr(parameters, name) != defaults[name]]
+    given = [PLACE_OF_LENS[0], *others] if placed else others
     if given:
         raise PerceptionError(
             f"calibration_file says where the lens is, and so do {', '.join(given)}: leave one of them out"

@@ -23,7 +23,8 @@ _BESIDE = "scope.yaml"
 def _parameters_path(arguments: argparse.Namespace) -> Path | None:
     if arguments.params_file is not None:
         return Path(arguments.params_file)
-    beside = Path(arguments.bag) / _BESIDE
+    bag = Path(arguments.bag)
+    beside = (bag if bag.is_dir() else bag.parent) / _BESIDE
     return beside if beside.is_file() else None
 
 

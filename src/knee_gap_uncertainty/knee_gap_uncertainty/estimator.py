@@ -25,6 +25,10 @@ MOST_PENDING = 128
 LEG_MOVED = "the leg body moved"
 
 
+# A quarter of a second of a tracker: slow replay, whose stamps fall behind the clock, is no delay.
+POSES_OF_DELAY = 32
+LATE = "the image came too long after the lens poses of its time"
+
 # Advice that nobody has taken yet.
 MOST_ADVICE = 16
 
@@ -60,6 +64,8 @@ class GapEstimator:
         self.calibration_flaw = ""
         self._calibration_error: CalibrationError | None = None
         self._frame_id = ""
+        # By how much the clock was ahead of the stamps of the latest poses: what an image's delay is held to.
+        self._pose_delays_ns: deque[int] = deque(maxlen=POSES_OF_DELAY)
         self._last_edges: Pending | None = None
         self._silence_told_ns = 0
         self._now_ns = 0
@@ -77,6 +83,7 @@ class GapEstimator:
             self.counts[f"pose refused: {refusal.value}"] += 1
         else:
             self._frame_id = pose.frame_id
+            self._pose_delays_ns.append(arrival_ns - pose.stamp_ns)
         return self._resolve(arrival_ns)
 
     def add_leg_pose(self, pose: LensPose) -> None:
@@ -109,6 +116,7 @@ class GapEstimator:
         if last is not None and edges.stamp_ns < last.edges.stamp_ns:
             self.counts["stamps ran backwards"] += 1
             self._pending.clear()
+            self._pose_delays_ns.clear()
             self._track = None
         self._last_edges = Pending(edges, arrival_ns)
         self._silence_told_ns = arrival_ns
@@ -140,6 +148,7 @@ class GapEstimator:
         if now_ns < self._now_ns:
             self.counts["clock ran backwards"] += 1
             self._pending.clear()
+            self._pose_delays_ns.clear()
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
                 self._silence_told_ns = now_ns
@@ -163,6 +172,8 @@ class GapEstimator:
             return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, flaw)
         pose = self._poses.at(edges.stamp_ns)
         if isinstance(pose, LensPose):
+            if self._is_late(pending):
+                return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, LATE)
             return self._measure(edges, pose)
         if pose is PoseRefusal.NOT_YET:
             if now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS:
@@ -171,6 +182,13 @@ class GapEstimator:
                 edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, "no lens pose follows the image"
             )
         return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, pose.value)
+
+    def _is_late(self, pending: Pending) -> bool:
+        """Whether an image came so long after the poses of its time that its answer is of the past."""
+        if not self._pose_delays_ns:
+            return False
+        delay_ns = pending.arrival_ns - pending.edges.stamp_ns - min(self._pose_delays_ns)
+        return delay_ns > self.parameters.max_delay * NANOSECONDS
 
     def _measure(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Estimate from the edges and their lens pose, within the track that they belong to."""

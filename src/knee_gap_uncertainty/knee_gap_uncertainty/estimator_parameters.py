@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from knee_gap_node.parameter_rules import broken_rule
 from knee_gap_uncertainty.errors import MeasurementError
 
 
@@ -68,6 +69,21 @@ class EstimatorParameters:
         },
     )
 
+    max_delay: float = field(
+        default=0.5,
+        metadata={
+            "description": "how much later than the lens poses, by its stamp, an image may come and still be "
+            "answered with a number [s]",
+            "range": (0.05, 10.0),
+        },
+    )
+    largest_gap: float = field(
+        default=0.03,
+        metadata={
+            "description": "gap above which an estimate is taken for a mistake: no joint opens so far [m]",
+            "range": (0.001, 1.0),
+        },
+    )
     leg_motion: float = field(
         default=0.0,
         metadata={
@@ -78,18 +94,6 @@ class EstimatorParameters:
     )
 
     def __post_init__(self) -> None:
-        """Refuse what no ROS range can: a combination or a value given in code."""
-        for name in ("tracker_bound", "max_pose_age", "max_edges_silence"):
-            if not getattr(self, name) > 0.0:
-                raise MeasurementError(f"{name} must be above 0, not {getattr(self, name)!r}")
-        if not 0.0 <= self.leg_motion < float("inf"):
-            raise MeasurementError(f"leg_motion must be finite and not negative, not {self.leg_motion!r}")
-        if not 0.0 < self.confidence_level < 1.0:
-            raise MeasurementError(f"confidence_level must lie in (0, 1), not {self.confidence_level!r}")
-        if not 0.0 <= self.common_share <= 1.0:
-            raise MeasurementError(f"common_share must lie in [0, 1], not {self.common_share!r}")
-        for name, choices in (("interval", ("worst_case", "paper")), ("apex", ("first", "second", "best"))):
-            if getattr(self, name) not in choices:
-                raise MeasurementError(
-                    f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}"
-                )
+        """Refuse what the metadata does not allow, in code as on the command line."""
+        if rule := broken_rule(self):
+            raise MeasurementError(rule)

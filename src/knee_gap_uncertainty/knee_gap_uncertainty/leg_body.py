@@ -24,7 +24,7 @@ class LegBody:
     """
 
     def __init__(self, max_pose_age: float) -> None:
-        self._poses = PoseBuffer(max_pose_age, capacity=2)
+        self._poses = PoseBuffer(max_pose_age, capacity=2, needs_error=False)
         self._longest_ns = round(AGES * max_pose_age * 1e9)
         self.pose: LensPose | None = None
 

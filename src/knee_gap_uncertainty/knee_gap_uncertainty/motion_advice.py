@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_node.parameter_rules import broken_rule
 from knee_gap_uncertainty.confidence_interval import confidence_interval
 from knee_gap_uncertainty.errors import BadInputError, MeasurementError
 from knee_gap_uncertainty.gap_range import gap_range
@@ -58,11 +59,8 @@ class AdviceParameters:
     )
 
     def __post_init__(self) -> None:
-        if self.advice_target not in ("snr", "width"):
-            raise BadInputError(f"advice_target must be snr or width, not {self.advice_target!r}")
-        for name in ("target_snr", "target_width", "farthest_travel"):
-            if not 0.0 < getattr(self, name) < inf:
-                raise BadInputError(f"{name} must be above 0 and finite, not {getattr(self, name)!r}")
+        if rule := broken_rule(self):
+            raise BadInputError(rule)
 
     @property
     def target(self) -> float:

@@ -40,6 +40,7 @@ class PoseRefusal(StrEnum):
     """Why a pose is not kept, or why there is none at a stamp."""
 
     NOT_FINITE = "the lens pose has numbers that are NaN or infinite"
+    NO_ERROR = "the lens pose's covariance is 0, which means unknown, or is none"
     NOT_UNIT = "the lens pose's quaternion is not of length 1"
     DUPLICATE = "the lens pose has the stamp of the one before it"
     FROZEN = "the lens pose repeats an old one bit by bit under new stamps"
@@ -54,7 +55,7 @@ class PoseBuffer:
     `max_pose_age` [s] is the longest time between the stamp asked for and either of its two poses; `capacity`
     the number of poses kept. Between poses the lens does not move evenly: `acceleration` [m/s^2] and
     `angular_acceleration` [rad/s^2] are the RMS lengths of a hand's, whose effect on the interpolated pose
-    its covariance includes.
+    its covariance includes. `needs_error`: a pose without a covariance is refused.
 
     Raises BadInputError for settings outside their range.
     """
@@ -66,6 +67,7 @@ class PoseBuffer:
         capacity: int = 2048,
         acceleration: float = 0.5,
         angular_acceleration: float = 2.0,
+        needs_error: bool = True,
     ) -> None:
         if not 0.0 < max_pose_age < 10.0:
             raise BadInputError(f"max_pose_age must lie in (0, 10) s, not {max_pose_age}")
@@ -75,6 +77,7 @@ class PoseBuffer:
             if not (value >= 0.0 and isfinite(value)):
                 raise BadInputError(f"{name} must be finite and not negative, not {value}")
         self.max_pose_age = max_pose_age
+        self._needs_error = needs_error
         self.reset_count = 0
         # Poses in a row that repeated the one before them.
         self._repeats = 0
@@ -102,6 +105,8 @@ class PoseBuffer:
         """
         if refusal := _refusal(pose):
             return refusal
+        if self._needs_error and not _has_error(pose):
+            return PoseRefusal.NO_ERROR
         if self._poses:
             newest = self._poses[-1]
             if pose.frame_id == newest.frame_id and pose.stamp_ns == newest.stamp_ns:
@@ -175,3 +180,9 @@ def _refusal(pose: LensPose) -> PoseRefusal | None:
     if abs(float(np.linalg.norm(pose.quaternion_xyzw)) - 1.0) > 1e-3:
         return PoseRefusal.NOT_UNIT
     return None
+
+
+def _has_error(pose: LensPose) -> bool:
+    """Whether a pose says how wrong it is: the message's default is zeros, and no tracker is without error."""
+    variances = np.diag(pose.covariance)
+    return bool(np.all(variances[:3] > 0.0) and np.all(variances[3:] >= 0.0))

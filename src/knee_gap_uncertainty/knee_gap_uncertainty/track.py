@@ -38,6 +38,7 @@ REASONS: dict[type[MeasurementError], str] = {
 UNBOUNDED = "the admitted errors leave the gap unbounded"
 UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
 CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
+TOO_LARGE = "the gap is larger than any joint's"
 UNCHECKED = "two views cannot check each other"
 # Along the line of the ray from the other view, one of two views may be wrong by any amount.
 FEWEST_VIEWS_TO_CHECK = 3
@@ -223,6 +224,8 @@ class Track:
         if interval.refused or not np.isfinite(fitted.gap):
             # The lower bounds stand; an upper one must not be taken for an answer.
             return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCERTAIN_DEPTH)
+        if fitted.gap > self._parameters.largest_gap:
+            return replace(self._told(blank, view, TOO_LARGE), status=GapStatus.UNKNOWN)
         if not bounds.gap_min <= fitted.gap <= bounds.gap_max:
             return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
         return replace(

@@ -19,6 +19,9 @@ from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 PERIOD_NS = 8_333_333
 START_NS = 1_700_000_000_000_000_000
 
+# A lens in the middle of its tracked body.
+AT_BODY = TrackingParameters(body_to_shaft_translation=(0.0, 0.0, 0.0))
+
 
 def hand_motion(index, *, name="scope", centre=(0.0, 0.0, 0.0)):
     """A body that sways as in a hand: 30 mm/s and 0.3 rad/s at most."""
@@ -44,7 +47,7 @@ def reasons(tracker, bodies):
 
 class TestLensPose:
     def test_a_straight_scope_on_an_identity_transform_is_the_body(self):
-        tracker = ScopeTracker(TrackingParameters(oblique_angle=0.0))
+        tracker = ScopeTracker(replace(AT_BODY, oblique_angle=0.0))
         body = hand_motion(7)
         lens = tracker.update(body)
         assert isinstance(lens, LensPose)
@@ -56,7 +59,7 @@ class TestLensPose:
 
     def test_the_oblique_tip_looks_up_by_its_angle(self):
         upright = BodyPose(START_NS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-        view = ScopeTracker().update(upright).matrix()[:3, 2]
+        view = ScopeTracker(AT_BODY).update(upright).matrix()[:3, 2]
         assert np.degrees(np.arccos(view[2])) == pytest.approx(30.0)
         assert view[1] == pytest.approx(-0.5)  # y is down in the picture
 
@@ -106,7 +109,7 @@ class TestLensPose:
 
     def test_errors_are_lengths_of_vectors(self):
         covariance = (
-            ScopeTracker(TrackingParameters(translation_error=0.003, rotation_error=0.006))
+            ScopeTracker(replace(AT_BODY, translation_error=0.003, rotation_error=0.006))
             .update(hand_motion(0))
             .covariance
         )
@@ -116,7 +119,7 @@ class TestLensPose:
 
 class TestRefusals:
     def test_a_hand_held_scope_is_never_refused(self):
-        tracker = ScopeTracker()
+        tracker = ScopeTracker(AT_BODY)
         assert set(reasons(tracker, (hand_motion(i) for i in range(500)))) == {None}
         assert tracker.accepted_count == 500
         assert tracker.validity.period == pytest.approx(PERIOD_NS / 1e9)
@@ -134,7 +137,7 @@ class TestRefusals:
         ],
     )
     def test_a_malformed_pose_is_refused_and_the_next_is_taken(self, fault, reason):
-        tracker = ScopeTracker()
+        tracker = ScopeTracker(AT_BODY)
         bodies = [hand_motion(i) for i in range(21)]
         bodies[10] = replace(bodies[10], **fault)
         found = reasons(tracker, bodies)
@@ -143,15 +146,17 @@ class TestRefusals:
         assert tracker.validity.counts == {reason: 1}
 
     def test_no_stamp(self):
-        assert reasons(ScopeTracker(), [replace(hand_motion(0), stamp_ns=0)]) == [RefusalReason.NO_STAMP]
+        assert reasons(ScopeTracker(AT_BODY), [replace(hand_motion(0), stamp_ns=0)]) == [
+            RefusalReason.NO_STAMP
+        ]
 
     def test_duplicates(self):
         bodies = [hand_motion(i // 2) for i in range(20)]
-        assert reasons(ScopeTracker(), bodies) == [None, RefusalReason.DUPLICATE] * 10
+        assert reasons(ScopeTracker(AT_BODY), bodies) == [None, RefusalReason.DUPLICATE] * 10
 
     def test_a_bag_that_starts_again_starts_afresh(self):
         bodies = [hand_motion(i) for i in range(100)]
-        tracker = ScopeTracker()
+        tracker = ScopeTracker(AT_BODY)
         found = reasons(tracker, bodies * 3)
         assert found.count(RefusalReason.STAMP_BACKWARDS) == 2
         assert found.count(None) == 298
@@ -160,7 +165,7 @@ class TestRefusals:
         bodies = [hand_motion(i) for i in range(60)]
         for i in range(20, 40):
             bodies[i] = replace(bodies[19], stamp_ns=bodies[i].stamp_ns)
-        found = reasons(ScopeTracker(), bodies)
+        found = reasons(ScopeTracker(AT_BODY), bodies)
         assert found[20:40] == [RefusalReason.FROZEN] * 20
         assert found[40] is RefusalReason.GAP
         assert set(found[:20] + found[41:]) == {None}
@@ -172,20 +177,20 @@ class TestRefusals:
             for i in range(40)
             if i != 20
         ]
-        assert set(reasons(ScopeTracker(), one_lost)) == {None}
+        assert set(reasons(ScopeTracker(AT_BODY), one_lost)) == {None}
         two_lost = [hand_motion(i) for i in range(40) if i not in (20, 21)]
-        found = reasons(ScopeTracker(), two_lost)
+        found = reasons(ScopeTracker(AT_BODY), two_lost)
         assert found[20] is RefusalReason.GAP
         assert found.count(None) == 37
 
     def test_a_set_rate_is_used_at_once(self):
-        tracker = ScopeTracker(validity=ValidityParameters(tracker_rate=120.0))
+        tracker = ScopeTracker(AT_BODY, validity=ValidityParameters(tracker_rate=120.0))
         assert reasons(tracker, [hand_motion(0), hand_motion(3)]) == [None, RefusalReason.GAP]
 
     def test_one_outlier_costs_one_pose(self):
         bodies = [hand_motion(i) for i in range(40)]
         bodies[20] = moved(bodies[20], [0.05, 0.0, 0.0])
-        found = reasons(ScopeTracker(), bodies)
+        found = reasons(ScopeTracker(AT_BODY), bodies)
         assert found[20] is RefusalReason.JUMP
         assert found.count(None) == 39
 
@@ -195,34 +200,34 @@ class TestRefusals:
         for i in range(20, 40):
             turned = flip * Rotation.from_quat(bodies[i].quaternion_xyzw)
             bodies[i] = replace(bodies[i], quaternion_xyzw=turned.as_quat())
-        found = reasons(ScopeTracker(), bodies)
+        found = reasons(ScopeTracker(AT_BODY), bodies)
         assert found[20:] == [RefusalReason.JUMP] * 20
 
     def test_a_body_that_stays_away_is_refused_until_the_hold_is_over(self):
         bodies = [
             hand_motion(i) if i < 100 else moved(hand_motion(i), [0.3, 0.0, 0.0]) for i in range(100 + 240)
         ]
-        found = reasons(ScopeTracker(validity=ValidityParameters(jump_hold=1.0)), bodies)
+        found = reasons(ScopeTracker(AT_BODY, validity=ValidityParameters(jump_hold=1.0)), bodies)
         assert found[100:220] == [RefusalReason.JUMP] * 120
         assert set(found[221:]) == {None}
-        assert set(reasons(ScopeTracker(), bodies)[100:]) == {RefusalReason.JUMP}
+        assert set(reasons(ScopeTracker(AT_BODY), bodies)[100:]) == {RefusalReason.JUMP}
 
     def test_a_second_jump_elsewhere_is_no_return(self):
         bodies = [hand_motion(i) for i in range(240)]
         bodies[100:] = [moved(body, [0.3, 0.0, 0.0]) for body in bodies[100:]]
         bodies[200:] = [moved(body, [0.0, 0.3, 0.0]) for body in bodies[200:]]
-        assert set(reasons(ScopeTracker(), bodies)[100:]) == {RefusalReason.JUMP}
+        assert set(reasons(ScopeTracker(AT_BODY), bodies)[100:]) == {RefusalReason.JUMP}
 
     def test_a_body_that_comes_back_is_taken_at_once(self):
         bodies = [hand_motion(i) for i in range(240)]
         bodies[100:200] = [moved(body, [0.3, 0.0, 0.0]) for body in bodies[100:200]]
-        found = reasons(ScopeTracker(), bodies)
+        found = reasons(ScopeTracker(AT_BODY), bodies)
         assert found[100:200] == [RefusalReason.JUMP] * 100
         assert set(found[200:]) == {None}
 
     def test_hostile_streams_raise_nothing_and_pass_nothing_malformed(self):
         rng = np.random.default_rng(3)
-        tracker = ScopeTracker()
+        tracker = ScopeTracker(AT_BODY)
         values = np.array([nan, inf, -inf, 0.0, 1e308, 1e-308, 1.0, -1.0])
         for _ in range(5000):
             body = BodyPose(
@@ -240,7 +245,7 @@ class TestRefusals:
 
 class TestSwappedBodies:
     def run(self, *, swapped, missing=()):
-        tracker = ScopeTracker()
+        tracker = ScopeTracker(AT_BODY)
         found = []
         for i in range(300):
             scope, leg = hand_motion(i), hand_motion(i + 77, name="leg", centre=(0.2, 0.1, 0.0))
@@ -261,7 +266,7 @@ class TestSwappedBodies:
 
     @pytest.mark.parametrize("hidden", [range(180, 230), range(90, 110), range(90, 230)])
     def test_a_swap_that_begins_or_ends_behind_an_occlusion_does_not_turn_the_names_round(self, hidden):
-        tracker, wrong, accepted = ScopeTracker(), 0, set()
+        tracker, wrong, accepted = ScopeTracker(AT_BODY), 0, set()
         for i in range(400):
             scope, leg = hand_motion(i), hand_motion(i + 77, name="leg", centre=(0.2, 0.1, 0.0))
             leg = replace(leg, stamp_ns=scope.stamp_ns)
@@ -278,7 +283,7 @@ class TestSwappedBodies:
 
     def test_labels_that_stay_are_believed_when_the_hold_is_over(self):
         """As after a start with swapped labels, which nothing can tell."""
-        tracker, found = ScopeTracker(validity=ValidityParameters(jump_hold=1.0)), []
+        tracker, found = ScopeTracker(AT_BODY, validity=ValidityParameters(jump_hold=1.0)), []
         for i in range(400):
             scope, leg = hand_motion(i), hand_motion(i, name="leg", centre=(0.2, 0.1, 0.0))
             if i < 100:
@@ -289,7 +294,7 @@ class TestSwappedBodies:
         assert set(found[222:]) == {None}
 
     def test_labels_that_go_round_among_three_bodies(self):
-        tracker, names, accepted = ScopeTracker(), ["scope", "leg", "probe"], []
+        tracker, names, accepted = ScopeTracker(AT_BODY), ["scope", "leg", "probe"], []
         for i in range(300):
             bodies = [hand_motion(i, centre=(0.15 * k, 0.05 * k, 0.0)) for k in range(3)]
             turned = names[1:] + names[:1] if 100 <= i < 200 else names
@@ -300,7 +305,7 @@ class TestSwappedBodies:
         assert all(accepted[:100] + accepted[201:])
 
     def test_a_scope_that_moved_beside_the_leg_unseen_is_no_leg(self):
-        tracker, found = ScopeTracker(), []
+        tracker, found = ScopeTracker(AT_BODY), []
         for i in range(600):
             leg = replace(
                 hand_motion(0, name="leg", centre=(0.1, 0.0, 0.0)), stamp_ns=hand_motion(i).stamp_ns
@@ -384,3 +389,8 @@ def test_angles_between_poses_are_exact_near_zero_and_near_a_half_turn():
         for sign in (1.0, -1.0):
             end = replace(start, quaternion_xyzw=sign * turned.as_quat())
             assert distance_and_angle(start, end)[1] == pytest.approx(angle, rel=1e-6)
+
+
+def test_tracker_that_does_not_know_where_the_lens_sits_is_refused():
+    with pytest.raises(PerceptionError, match="where the lens sits on the tracked body is not known"):
+        ScopeTracker()

@@ -36,9 +36,14 @@ def told(capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
+SCOPE = "tracking_node:\n  ros__parameters:\n    body_to_shaft_translation: [0.0, 0.0, 0.2]\n"
+
+
 def test_process_of_empty_images_says_so_for_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert process.main([str(write(tmp_path / "bag")), str(out)]) == 0
+    bag = write(tmp_path / "bag")
+    (bag / "scope.yaml").write_text(SCOPE)
+    assert process.main([str(bag), str(out)]) == 0
     assert "50 /knee_gap/gap_edges" in capsys.readouterr().out
     with BagReader(out) as reader:
         statuses = [reader.deserialize(m).status for m in reader.messages(["/knee_gap/gap"])]
@@ -54,8 +59,12 @@ def test_process_refuses_mistakes_in_one_line(tmp_path: Path, capsys: pytest.Cap
     out = str(tmp_path / "out")
     assert process.main([str(tmp_path / "nothing"), out]) == 1
     assert "does not exist" in told(capsys)
+    (Path(poor) / "scope.yaml").write_text(SCOPE)
     assert process.main([poor, out]) == 1
     assert f"has no topic {INFO}; it has " in told(capsys)
+    assert process.main([bag, out]) == 1
+    assert "where the lens sits on the tracked body is not known" in told(capsys)
+    (Path(bag) / "scope.yaml").write_text(SCOPE)
     assert process.main([bag, bag]) == 1
     assert "exists already" in told(capsys)
     assert process.main([bag, out, "--pose", "/other"]) == 1

@@ -11,7 +11,7 @@ from knee_gap_perception.optitrack.natnet_client import NatNetClient, NatNetPara
 from knee_gap_perception.optitrack.natnet_packets import NatNetVersion, decode_packet
 from knee_gap_perception.pose_validity import RefusalReason
 from knee_gap_perception.poses import BodyPose, LensPose
-from knee_gap_perception.tracking import ScopeTracker
+from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_simulation import natnet_server_packets as packets
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.natnet_server import NatNetServer, ServerSettings, main
@@ -108,7 +108,11 @@ def test_no_hidden_or_swapped_pose_is_published():
         swap_period=1.13,
         swap_length=0.3,
     )
-    scene, tracker, worst = TrackedScene(("scope", "tibia", "clock"), faults, seed=3), ScopeTracker(), 0.0
+    scene, tracker, worst = (
+        TrackedScene(("scope", "tibia", "clock"), faults, seed=3),
+        ScopeTracker(TrackingParameters(body_to_shaft_translation=(0.0, 0.0, 0.0))),
+        0.0,
+    )
     for number in range(150 * 120):
         time_s = 1000.0 + number / 120.0
         content = packets.FrameContent(number=number, bodies=scene.bodies(time_s))
