@@ -10,13 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from knee_gap_uncertainty.joint_motion import (
-    Finding,
-    JointMotionTest,
-    Observations,
-    motion_statistics,
-    observations,
-)
+from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
+from knee_gap_uncertainty.motion_statistics import Observations, motion_statistics, observations
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.simulated_motion import Situation, simulate
 from knee_gap_uncertainty.view_window import ViewWindow

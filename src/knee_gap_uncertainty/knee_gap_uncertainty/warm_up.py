@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from knee_gap_uncertainty import gap_range, joint_motion, multi_view
+from knee_gap_uncertainty import gap_range, motion_statistics, multi_view
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapStatus
 from knee_gap_uncertainty.motion_advice import AdviceParameters
@@ -27,7 +27,7 @@ def warm_up() -> set[GapStatus]:
     """Compile what is not on disk yet, load the rest; return the statuses that the track went through."""
     gap_range.warm_up()
     multi_view.warm_up()
-    joint_motion.warm_up()
+    motion_statistics.warm_up()
     statuses: set[GapStatus] = set()
     targets: tuple[Literal["snr", "width"], ...] = ("snr", "width")
     for target in targets:
