@@ -3,6 +3,7 @@
 import argparse
 import os
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -98,6 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
     parser.add_argument("--rate", type=float, default=1.0, help="times as fast as recorded")
     arguments = parser.parse_args(argv)
+    # Whoever ends the demo, by Ctrl-C or otherwise, ends its processes with it.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run(arguments.bag, arguments.out, arguments.rate)
     except (BagError, SimulationError, StartError, OSError) as error:

@@ -1,4 +1,8 @@
-"""The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`."""
+"""The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`.
+
+The file says all that a laboratory has to set, whether images come compressed included; config/knee_gap.yaml is
+one to begin with.
+"""
 
 from pathlib import Path
 
@@ -25,7 +29,6 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("params", default_value=str(CONFIG / "knee_gap.yaml")),
             DeclareLaunchArgument("namespace", default_value="knee_gap"),
-            DeclareLaunchArgument("image_transport", default_value="raw", choices=["raw", "compressed"]),
             IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
             *(
                 Node(
@@ -33,14 +36,7 @@ def generate_launch_description() -> LaunchDescription:
                     executable=name,
                     name=name,
                     namespace=LaunchConfiguration("namespace"),
-                    parameters=[
-                        LaunchConfiguration("params"),
-                        *(
-                            [{"image_transport": LaunchConfiguration("image_transport")}]
-                            if name == "segmentation_node"
-                            else []
-                        ),
-                    ],
+                    parameters=[LaunchConfiguration("params")],
                     output="screen",
                 )
                 for name, package in NODES.items()

@@ -111,7 +111,7 @@ def pose_message(T_world_x: FloatArray, stamp_ns: int) -> Any:
 def write_parameters(path: Path, scope: Scope) -> None:
     """Write the scope as a ROS parameter file, for any node that takes such parameters."""
     with path.open("w", encoding="utf-8") as file:
-        YAML().dump({"/**": {"ros__parameters": scope.parameters()}}, file)
+        YAML().dump({"/**/tracking_node": {"ros__parameters": scope.parameters()}}, file)
 
 
 def _stamp(message: Any, stamp_ns: int, frame_id: str) -> None:

@@ -125,7 +125,7 @@ def _progress(items: Iterable[int], text: str) -> Iterable[int]:
 
 
 def _show_parameters(calibration: Calibration) -> None:
-    print("/**:\n  ros__parameters:")
+    print("/**/tracking_node:\n  ros__parameters:")
     for name, value in calibration.tracking_parameters().items():
         print(f"    {name}: {value}")
 
