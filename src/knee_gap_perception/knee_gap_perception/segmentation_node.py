@@ -94,8 +94,8 @@ class SegmentationNode(BaseNode):
     def take_waiting_poses(self) -> None:
         """Take all poses that are there.
 
-        The executor takes one message of each topic a turn. Poses come twice as often as images, so that where
-        the machine is busy they would fall behind and be too old for every image.
+        The executor takes one message of each topic a turn. Poses come twice as often as images, so that
+        where the machine is busy they would fall behind and be too old for every image.
         """
         with self._poses.handle:
             while (taken := self._poses.handle.take_message(PoseWithCovarianceStamped, False)) is not None:
