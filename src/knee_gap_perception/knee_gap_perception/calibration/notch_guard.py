@@ -1,7 +1,7 @@
-"""Refuses images of an oblique scope that was turned since its calibration, where nothing else tells the turn.
+"""Refuses images of an oblique scope that was turned since its calibration, where nothing else tells it.
 
-The turn moves the lens about the shaft, and only a second tracked body lets `tracking_node` follow it frame by
-frame. Where there is none the notch in the image still shows that the scope was turned: then nothing is valid.
+The turn moves the lens about the shaft, and only a second tracked body lets `tracking_node` follow it frame
+by frame. Where there is none the notch in the image still shows the turn: then nothing is valid.
 """
 
 import numpy as np
@@ -21,9 +21,10 @@ class NotchGuard:
 
     def __init__(self, calibration: Calibration) -> None:
         oblique = calibration.oblique
-        # A second body tells the turn, and the tracker follows it.
-        followed = oblique is None or oblique.T_head_scope is not None
-        self._calibration = None if followed or not np.isfinite(oblique.notch_angle) else calibration
+        self._calibration: Calibration | None = None
+        # Where a second body tells the turn, the tracker follows it.
+        if oblique is not None and oblique.T_head_scope is None and np.isfinite(oblique.notch_angle):
+            self._calibration = calibration
         self._finder = FieldOfViewFinder()
         self._count = 0
         self._agreeing = 0
@@ -46,8 +47,9 @@ class NotchGuard:
         if self._agreeing >= AGREEING or (is_turned and self.flaw):
             self._agreeing = 0
             self.flaw = (
-                f"the scope is turned by {np.degrees(turn):.0f} deg in its camera head since the calibration, "
-                "which only a second tracked body (scope_turn_body) can follow: turn it back, or calibrate again"
+                f"the scope is turned by {np.degrees(turn):.0f} deg in its camera head since the "
+                "calibration, which only a second tracked body (scope_turn_body) can follow: turn it back "
+                "or calibrate again"
                 if is_turned
                 else ""
             )
