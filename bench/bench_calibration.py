@@ -2,9 +2,9 @@
 
     tools/env python bench/bench_calibration.py --board dots --lens pinhole --first 200 --seeds 8
 
-Makes a calibration bag a seed, calibrates from it with the commands a user has, and prints the lens's error, its
-normalised square (NEES, 6 degrees of freedom), and the clock's error. Ends with 1 where a lens is off by more than
-0.2 mm or 0.2 degrees, a clock by more than 1 ms, or a truth lies outside 99.9 % of what was stated.
+Makes a calibration bag a seed, calibrates from it with the commands a user has, and prints the lens's error,
+its normalised square (NEES, 6 degrees of freedom), and the clock's error. Ends with 1 where a lens is off by
+more than 0.2 mm or 0.2 degrees, a clock by more than 1 ms, or a truth lies outside 99.9 % of what was stated.
 """
 
 import argparse
@@ -58,8 +58,8 @@ def judged(recording: CalibrationRecording, folder: Path, views: int) -> tuple[f
     late = clock.offset - truth.time_offset
     print(
         f"seed {recording.seed}: lens off by {1e3 * shift:.4f} mm (stated {1e3 * stated[0]:.4f} RMS), "
-        f"{np.degrees(turn):.4f} deg ({np.degrees(stated[1]):.4f}); NEES {nees:.2f}; clock off by {1e3 * late:+.4f} ms "
-        f"({late / clock.sigma:+.2f} sigma)",
+        f"{np.degrees(turn):.4f} deg ({np.degrees(stated[1]):.4f}); NEES {nees:.2f}; "
+        f"clock off by {1e3 * late:+.4f} ms ({late / clock.sigma:+.2f} sigma)",
         flush=True,
     )
     within = shift < MOST_SHIFT and turn < MOST_TURN and abs(late) < MOST_TIME
@@ -89,10 +89,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     known = nees[np.isfinite(nees)]
     freedom = 6 * len(known)
     print(
-        f"{arguments.board}, {arguments.lens}: {sum(good for _, good in results)} of {len(results)} within the limits; "
-        f"{int((known < chi2.ppf(0.95, 6)).sum())} of {len(known)} inside the stated 95 %; sum of NEES {known.sum():.1f} "
-        f"(exact: {chi2.ppf(0.025, freedom):.0f} to {chi2.ppf(0.975, freedom):.0f}; below: stated too large, "
-        "never too small)"
+        f"{arguments.board}, {arguments.lens}: "
+        f"{sum(good for _, good in results)} of {len(results)} within the limits; "
+        f"{int((known < chi2.ppf(0.95, 6)).sum())} of {len(known)} inside the stated 95 %; "
+        f"sum of NEES {known.sum():.1f} (exact: {chi2.ppf(0.025, freedom):.0f} to "
+        f"{chi2.ppf(0.975, freedom):.0f}; below: stated larger than it is)"
     )
     return 0 if all(good for _, good in results) else 1
 

@@ -1,22 +1,22 @@
-"""Distances of known dots by motion stereo with a real tracked laparoscope, each by a calibration that has not seen it.
+"""Distances of known dots by motion stereo with a real tracked laparoscope, unseen by the calibration.
 
     tools/env python bench/dot_distances.py FOLDER
 
-FOLDER holds a session as `calib.left.points.N.txt` (id, column, row), `calib.tracking.N.4x4` (body in the tracker's
-frame, mm) and, one level up or beside, `*_centres.txt` (id, x, y, z in mm). Three ways: calibrated on all and measured
-on the same (in sample); on the dots of even number and measured on the odd ones, and the reverse; on all views but
-one, and measured between that view and each of the others. Every true distance has to lie in the worst-case range.
+FOLDER holds a session as `calib.left.points.N.txt` (id, column, row), `calib.tracking.N.4x4` (body in the
+tracker's frame, mm) and, there or above, `*_centres.txt` (id, x, y, z in mm). Three ways: calibrated on all
+and measured on the same; on the dots of even number and measured on the odd ones, and the reverse; on all
+views but one, and measured between that view and each of the others. Every true distance has to lie in its
+range.
 """
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from knee_gap_perception.calibration import hand_eye, intrinsics
 from knee_gap_perception.calibration.boards import BoardView
@@ -34,7 +34,7 @@ MODELS = ("plumb_bob", "equidistant")
 
 
 class Tally(NamedTuple):
-    """Ratios of measured to true distances, widths of the ranges to them, how many lie inside, how many had no range."""
+    """Ratios of measured to true distances, widths of the ranges to them, how many lie inside or had none."""
 
     ratios: list[float]
     widths: list[float]
@@ -73,11 +73,11 @@ def calibrated(views: Views, size: tuple[int, int], model: LensModel) -> HandEye
     return calibrate_hand_eye(views, fit.intrinsics, model)
 
 
-def only(views: Views, keep: Callable[[npt.NDArray[np.int_]], npt.NDArray[np.bool_]]) -> Views:
-    """The views with those of their dots whose numbers are kept."""
+def only(views: Views, divisor: int, remainder: int) -> Views:
+    """The views with those of their dots whose numbers leave a remainder."""
     kept = []
     for view in views:
-        mask = keep(view.board.ids)
+        mask = view.board.ids % divisor == remainder
         board = view.board
         board = BoardView(board.stamp_ns, board.ids[mask], board.points[mask], board.pixels[mask])
         kept.append(view._replace(board=board))
@@ -150,8 +150,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         tables = {"in sample": joined([measured(found, everything, s) for s in range(arguments.seeds)])}
         by_dots = []
         for parity in (0, 1):
-            found = calibrated(only(views, lambda ids, parity=parity: ids % 2 == parity), size, model)
-            rest = only(views, lambda ids, parity=parity: ids % 2 != parity)
+            found = calibrated(only(views, 2, parity), size, model)
+            rest = only(views, 2, 1 - parity)
             by_dots += [measured(found, list(combinations(rest, 2)), s) for s in range(arguments.seeds)]
         tables["dots that the calibration has not seen"] = joined(by_dots)
         by_views = []

@@ -160,6 +160,21 @@ def test_poses_are_used_once_they_come_and_the_image_waits_for_the_next(
     feed.stamp_ns += 10**9
 
 
+def test_poses_that_come_in_a_burst_are_all_there_for_the_image_behind_them(
+    feed: Feed, frames: list[np.ndarray]
+) -> None:
+    feed.camera()
+    stamp = feed.stamp_ns + 10**9
+    before = feed.answers
+    for k in range(48, -1, -1):
+        feed.pose(stamp + 1_000_000 - k * 8_333_333)
+    feed.publish(frames[3], "bgr8", stamp)
+    feed.client.spin_until(lambda: feed.answers > before)
+    edges = feed.client.received["gap_edges"][before]
+    assert (edges.status, edges.pose_used) == (VALID, True)
+    feed.stamp_ns = stamp + 10**9
+
+
 def test_a_point_is_chosen_and_a_track_ended_by_service(feed: Feed, frames: list[np.ndarray]) -> None:
     feed.camera()
     first = feed.send(frames[0])

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from knee_gap_perception.calibration.calibration_file import Calibration
 from knee_gap_perception.calibration.camera_check import disagreement
-from knee_gap_perception.calibration.notch_guard import NotchGuard
 from knee_gap_perception.camera import Camera, camera_from_info
 from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
@@ -66,7 +65,6 @@ class EdgeStream:
         self.calibration = calibration
         # Why the images are none of the calibration's; empty where they are.
         self.size_flaw = ""
-        self._notch = NotchGuard(calibration) if calibration is not None else None
         if calibration is not None:
             self._camera, self._camera_flaw = calibration.require_camera().camera(), ""
         self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
@@ -142,7 +140,7 @@ class EdgeStream:
             is_compressed = hasattr(message, "format")
             image = image_from_compressed(message) if is_compressed else image_from_message(message)
             self._image = image
-            self._refuse_other_scope(image)
+            self._refuse_other_size(image)
             if self._camera is None:
                 raise PerceptionError(self._camera_flaw)
             lens_pose = self._poses.at(stamp)
@@ -161,7 +159,7 @@ class EdgeStream:
             self.counts["VALID, a point hidden"] += 1
         return edges
 
-    def _refuse_other_scope(self, image: Image) -> None:
+    def _refuse_other_size(self, image: Image) -> None:
         self.size_flaw = ""
         if self.calibration is None:
             return
@@ -170,8 +168,6 @@ class EdgeStream:
         except PerceptionError as error:
             self.size_flaw = str(error)
             raise
-        if self._notch is not None and (flaw := self._notch.look(image)):
-            raise PerceptionError(flaw)
 
     def choose(self, column: float, row: float) -> str:
         """Begin anew at the gap nearest to a pixel of the last image; says why not, nothing if it is done."""

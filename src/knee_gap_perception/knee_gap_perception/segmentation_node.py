@@ -52,7 +52,9 @@ class SegmentationNode(BaseNode):
         self.create_subscription(PointStamped, "clicked_point", self.on_click, RESULT_QOS)
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
         self.create_service(Trigger, "start_anew", self.on_start_anew)
-        self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, TRACKER_QOS)
+        self._poses = self.create_subscription(
+            PoseWithCovarianceStamped, "scope_pose", self.on_pose, TRACKER_QOS
+        )
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         told = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
@@ -74,6 +76,7 @@ class SegmentationNode(BaseNode):
 
     def publish_ready(self) -> None:
         """Publish the edges in the images that wait no longer, and the pictures that anybody wants."""
+        self.take_waiting_poses()
         for edges in self._stream.ready(self.now_ns()):
             message = fill_gap_edges(GapEdges(), edges)
             self._edges.publish(message)
@@ -87,6 +90,16 @@ class SegmentationNode(BaseNode):
             self._patience.cancel()
         elif self._patience.is_canceled():
             self._patience.reset()
+
+    def take_waiting_poses(self) -> None:
+        """Take all poses that are there.
+
+        The executor takes one message of each topic a turn. Poses come twice as often as images, so that
+        where the machine is busy they would fall behind and be too old for every image.
+        """
+        with self._poses.handle:
+            while (taken := self._poses.handle.take_message(PoseWithCovarianceStamped, False)) is not None:
+                self._stream.on_lens_pose(taken[0])
 
     def now_ns(self) -> int:
         """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""

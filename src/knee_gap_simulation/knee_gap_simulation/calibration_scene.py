@@ -79,7 +79,7 @@ class DotBoard:
 def _table(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> npt.NDArray[np.float32]:
     """Speckles of the table's reflectance."""
     table = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 0.00025 * scale)
-    return np.clip(0.45 + 0.12 * table / table.std(), 0.15, 0.8).astype(np.float32)
+    return np.asarray(np.clip(0.45 + 0.12 * table / table.std(), 0.15, 0.8), dtype=np.float32)
 
 
 @dataclass(frozen=True)

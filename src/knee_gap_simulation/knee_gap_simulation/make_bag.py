@@ -43,8 +43,8 @@ from knee_gap_simulation.truth import SceneTruth
 class Recording:
     """A recording of the simple scene of two rims. Lengths [m], times [s].
 
-    `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording; without
-    it they are the nominal ones. `video_delay`: how late images are stamped.
+    `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording;
+    without it they are the nominal ones. `video_delay`: how late images are stamped.
     """
 
     gap: float = 0.004

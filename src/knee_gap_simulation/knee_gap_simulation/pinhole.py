@@ -33,6 +33,6 @@ class PinholeLens(Lens):
         angle = np.arctan2(np.hypot(direction[..., 0], direction[..., 1]), direction[..., 2])
         with np.errstate(invalid="ignore", divide="ignore"):
             pixel = self.focal_px * direction[..., :2] / direction[..., 2:]
-        pixel = pixel + (self.centre_x_px, self.centre_y_px)
+        pixel += np.array([self.centre_x_px, self.centre_y_px])
         pixel[~(angle <= self.field_of_view / 2.0)] = np.nan
         return np.asarray(pixel)

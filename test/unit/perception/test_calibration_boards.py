@@ -7,6 +7,8 @@ import pytest
 
 from knee_gap_perception.calibration.boards import CharucoBoard, DotGrid, board_from_text
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_simulation.calibration_bag import CalibrationMotion, CalibrationRecording, calibration_truth
+from knee_gap_simulation.calibration_scene import BoardCamera
 
 
 def warped(flat: npt.NDArray[np.uint8], homography: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
@@ -69,3 +71,22 @@ def test_no_board_is_none() -> None:
 def test_other_boards_are_refused(text: str, reason: str) -> None:
     with pytest.raises(PerceptionError, match=reason):
         board_from_text(text)
+
+
+@pytest.mark.parametrize("lens", ["equidistant", "pinhole"])
+def test_dots_are_found_on_a_table_that_shows_more_blobs_than_the_board(lens: str) -> None:
+    recording = CalibrationRecording(seed=200, board="dots", lens=lens)
+    truth = calibration_truth(recording)
+    motion = CalibrationMotion(recording, truth)
+    camera = BoardCamera(truth.board, truth.lens, truth.scope, 200)
+    board = board_from_text(truth.board.text)
+    found = 0
+    for time in np.linspace(0.0, 15.0, 8):
+        T_board_lens = motion.lens_on_board(time)
+        view = board.find(camera.frame(T_board_lens, 0.0), 0)
+        if view is None:
+            continue
+        found += 1
+        expected = truth.lens.pixels((view.points - T_board_lens[:3, 3]) @ T_board_lens[:3, :3])
+        assert np.abs(view.pixels - expected).max() < 0.5
+    assert found >= 6

@@ -19,7 +19,6 @@ from knee_gap_perception.calibration.calibration_file import (
 from knee_gap_perception.calibration.camera_check import disagreement
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.notch_guard import EVERY, NotchGuard
 from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
@@ -169,25 +168,3 @@ def test_what_is_told_of_it_arrives_in_the_order_of_rep_103() -> None:
     nothing = calibration_from_message(fill_scope_calibration(message, "tracking_node", None))
     assert nothing.hash == ""
     assert nothing.error is None
-
-
-def disc(notch: float) -> Any:
-    """A lit disc with a notch at an angle."""
-    y, x = np.mgrid[:240, :320].astype(float)
-    radius, angle = np.hypot(x - 160, y - 120), np.arctan2(y - 120, x - 160)
-    away = (angle - notch + np.pi) % (2 * np.pi) - np.pi
-    height = 6.0 * (1 - np.abs(away) / np.radians(4.0))
-    lit = np.clip(110.0 - np.maximum(height, 0.0) - radius, 0.0, 1.0)
-    return np.repeat((180 * lit)[..., None], 3, axis=2).astype(np.uint8)
-
-
-def test_a_scope_that_was_turned_is_refused_where_nothing_follows_the_turn() -> None:
-    by_notch = replace(SCOPE, oblique=Oblique(0.4, AXIS, 5e-4, 4e-5))
-    guard = NotchGuard(by_notch)
-    assert not any(guard.look(disc(0.4)) for _ in range(2 * EVERY))
-    told = [guard.look(disc(0.7)) for _ in range(4 * EVERY)]
-    assert not told[0]  # one look is none
-    assert "turned by 17 deg" in told[-1]
-    assert not [guard.look(disc(0.4)) for _ in range(4 * EVERY)][-1]
-    followed = NotchGuard(replace(TURNED, oblique=replace(TURNED.oblique, notch_angle=0.4)))  # type: ignore[type-var]
-    assert not any(followed.look(disc(0.7)) for _ in range(4 * EVERY))

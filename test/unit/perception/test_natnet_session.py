@@ -300,6 +300,13 @@ class TestTroubleInWords:
         assert world.session.counts["frames of a second server"] == 100
         assert "second server" in world.session.status(world.now).words
 
+    def test_the_wrong_one_of_two_on_a_machine_is_given_up_though_it_came_first(self):
+        world, other, given = World(), Motive(first_tick=4), 0
+        for _ in range(400):
+            world.session.receive(other.frame(world.now), (MOTIVE[0], 2000), world.now)
+            given += len(world.run(0.01))
+        assert given > 150
+
     def test_a_body_that_is_not_there_is_told_those_that_are(self):
         (frame, _), *_ = World().run(1.0)
         with pytest.raises(

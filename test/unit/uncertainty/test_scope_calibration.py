@@ -1,4 +1,4 @@
-"""The shared error of a calibration: what a refit with a wrong scope shows, and that no number of views undoes it."""
+"""The shared error of a calibration: what a refit with a wrong scope shows, whatever the views."""
 
 from dataclasses import replace
 

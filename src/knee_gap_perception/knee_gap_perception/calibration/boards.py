@@ -3,6 +3,7 @@
 Board frame: the board is the plane z = 0, x along its columns, y along its rows [m].
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -13,6 +14,8 @@ import numpy.typing as npt
 from knee_gap_perception.calibration.rigid import Array
 from knee_gap_perception.errors import PerceptionError
 
+_DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+DARK, UNEVEN = 0.6, 0.12  # of the paper around a dot: the dot's brightness, and the paper's unevenness
 MIN_POINTS = 8  # a view with fewer points says too little about its own pose
 BOARD_SYNTAX = (
     "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM[:DICTIONARY], dots:COLUMNSxROWS:PITCH_MM (asymmetric, pitch "
@@ -121,6 +124,12 @@ class DotGrid:
         found, centres = cv2.findCirclesGrid(
             grey, (self.columns, self.rows), None, layout | cv2.CALIB_CB_CLUSTERING, detector
         )
+        dots = _printed(grey, detector.detect(grey)) if not found else ()
+        if len(dots) >= self.columns * self.rows:
+            # Without a detector OpenCV takes the dots themselves, which its stub does not know.
+            found, centres = cv2.findCirclesGrid(  # type: ignore[call-overload]
+                dots, (self.columns, self.rows), layout | cv2.CALIB_CB_CLUSTERING, None, _FINDER
+            )
         if not found:
             return None
         pixels = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
@@ -169,6 +178,28 @@ def _refined(grey: npt.NDArray[np.uint8], corners: Any, points: Array, clear: fl
         found = cv2.cornerSubPix(grey, refined[chosen].copy(), (int(half), int(half)), (-1, -1), stop)
         refined[chosen] = np.asarray(found).reshape(-1, 2)
     return np.asarray(refined, dtype=np.float64)
+
+
+_FINDER = cv2.CirclesGridFinderParameters()
+
+
+def _printed(grey: npt.NDArray[np.uint8], blobs: Sequence[cv2.KeyPoint]) -> npt.NDArray[np.float32]:
+    """Centres (n, 1, 2) of the blobs that are ink on paper: far darker than an even ring around them.
+
+    What lies around the board may show more blobs than the board does.
+    """
+    ring = np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=-1)
+    kept = []
+    for blob in blobs:
+        centre, radius = np.array(blob.pt), 0.5 * blob.size
+        around = np.rint(centre + 1.7 * radius * ring).astype(int)
+        if (around < 0).any() or (around >= grey.shape[::-1]).any():
+            continue
+        paper = grey[around[:, 1], around[:, 0]].astype(float)
+        ink = float(grey[round(blob.pt[1]), round(blob.pt[0])])
+        if ink < DARK * paper.min() and paper.std() < UNEVEN * paper.mean():
+            kept.append(blob.pt)
+    return np.array(kept, dtype=np.float32).reshape(-1, 1, 2)
 
 
 def _blobs(image_size: int) -> Any:

@@ -73,6 +73,7 @@ class NatNetSession:
         self._latency_ns = 0
         self._last_number: int | None = None
         self._data_from: Address | None = None
+        self._data_since_ns = 0
         self._other_ns = 0
         self._other_address = ""
         self._fault = ""
@@ -259,9 +260,16 @@ class NatNetSession:
         return BodyFrame(stamp_ns + ros_offset_ns, bodies, self.names, not exposure_known)
 
     def _is_my_server(self, sender: Address, arrival_ns: int) -> bool:
-        """Two servers on one machine differ by their port only; the first is kept while it sends."""
-        if self._data_from is None or arrival_ns - self._frame_ns > NO_DATA_NS:
-            self._data_from = sender
+        """Two servers on one machine differ by their port only; one is kept while its frames can be used.
+
+        The first may be the one that the conversation is not with: its times do not fit the echoes.
+        """
+        silent = arrival_ns - self._frame_ns > NO_DATA_NS
+        useless = arrival_ns - max(self._given_ns, self._data_since_ns) > NO_DATA_NS
+        known = self.clock is None or self.clock.ready(arrival_ns)
+        if self._data_from is None or silent or (sender != self._data_from and useless and known):
+            self._data_from, self._data_since_ns = sender, arrival_ns
+            self._last_number = None
         if sender == self._data_from:
             return True
         self.counts["frames of a second server"] += 1
