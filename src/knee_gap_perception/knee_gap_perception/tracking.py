@@ -42,8 +42,8 @@ class TrackingParameters:
     body_to_shaft_translation: tuple[float, ...] = field(
         default=(nan, nan, nan),
         metadata={
-            "description": "Position of the lens in the tracked body, x y z [m]; NaN is not known, and then a "
-            "calibration_file has to tell",
+            "description": "Position of the lens in the tracked body, x y z [m]; NaN is not known, and then "
+            "a calibration_file has to tell",
             "range": (-2.0, 2.0),
             "nan": True,
         },

@@ -87,7 +87,11 @@ def fit_intrinsics(
     """
     usable = [view for view in views if len(view.ids) >= MIN_POINTS]
     _check_views(usable, len(views))
-    parameters, poses = _start(usable, width_px, height_px, model)
+    parameters = _start(usable, width_px, height_px, model)
+    # By so rough a lens a view at the border of the picture may have no pose to begin from.
+    usable = [view for view in usable if tells_pose(view, parameters, model)]
+    _check_views(usable, len(views))
+    poses = np.array([board_pose(view, parameters, model) for view in usable])
     dropped = 0
     for _ in range(3):
         parameters, poses = minimise(_Bundle(usable, model), _State(parameters, poses))
@@ -99,6 +103,15 @@ def fit_intrinsics(
         _check_views(usable, len(views))
     _check_geometry(usable, poses, width_px, height_px, parameters, model)
     return _result(usable, parameters, poses, model, (width_px, height_px), dropped)
+
+
+def tells_pose(view: BoardView, parameters: Array, model: LensModel) -> bool:
+    """Whether a view's points allow a pose of the board."""
+    try:
+        board_pose(view, parameters, model)
+    except PerceptionError:
+        return False
+    return True
 
 
 def board_pose(view: BoardView, parameters: Array, model: LensModel) -> Array:
@@ -152,10 +165,8 @@ def _check_geometry(
         )
 
 
-def _start(
-    views: Sequence[BoardView], width_px: int, height_px: int, model: LensModel
-) -> tuple[Array, Array]:
-    """Parameters and poses of the undistorted lens whose focal length fits best, by a few of the views."""
+def _start(views: Sequence[BoardView], width_px: int, height_px: int, model: LensModel) -> Array:
+    """Parameters of the undistorted lens whose focal length fits best, by a few of the views."""
     step = max(1, len(views) // 12)
     best: tuple[float, Array] | None = None
     for focal in np.geomspace(0.3, 3.0, 15) * max(width_px, height_px):
@@ -172,8 +183,7 @@ def _start(
             best = rms, parameters
     if best is None:
         raise PerceptionError("no focal length explains the views: is --board the board in the picture?")
-    poses = np.array([board_pose(view, best[1], model) for view in views])
-    return best[1], poses
+    return best[1]
 
 
 def _residuals(view: BoardView, T_lens_board: Array, parameters: Array, model: LensModel) -> Array:
