@@ -1,7 +1,7 @@
 """The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`.
 
-The file says all that a laboratory has to set, whether images come compressed included; config/knee_gap.yaml is
-one to begin with.
+The file says all that a laboratory has to set, whether images come compressed included; config/knee_gap.yaml
+is one to begin with.
 """
 
 from pathlib import Path

@@ -183,6 +183,6 @@ def _refusal(pose: LensPose) -> PoseRefusal | None:
 
 
 def _has_error(pose: LensPose) -> bool:
-    """Whether a pose says how wrong it is: the message's default is zeros, and no tracker is without error."""
+    """Whether a pose says how wrong it is: zeros are the message's default, and no tracker is perfect."""
     variances = np.diag(pose.covariance)
     return bool(np.all(variances[:3] > 0.0) and np.all(variances[3:] >= 0.0))
