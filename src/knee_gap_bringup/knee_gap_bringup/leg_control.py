@@ -43,6 +43,15 @@ class LegParameters:
         metadata={"description": "silence of the gap after which the leg is held [s]", "range": (0.1, 5.0)},
     )
 
+    max_age: float = field(
+        default=0.5,
+        metadata={
+            "description": "age of an estimate, by its stamp, above which the leg is held; a bag that is played "
+            "needs --clock and use_sim_time [s]",
+            "range": (0.05, 10.0),
+        },
+    )
+
     def __post_init__(self) -> None:
         """Refuse a leg that may not open as far as the instrument needs."""
         if not self.largest_gap > self.instrument_diameter:
@@ -52,10 +61,12 @@ class LegParameters:
             )
 
 
-def decide(valid: bool, gap_min: float, gap_max: float, parameters: LegParameters) -> Command:
-    """Command from one estimate [m]: its lower bound says whether the instrument fits."""
+def decide(valid: bool, age: float, gap_min: float, gap_max: float, parameters: LegParameters) -> Command:
+    """Command from one estimate [m] of some age [s]: its lower bound says whether the instrument fits."""
     if not valid or not isfinite(gap_min) or not isfinite(gap_max):
         return Command(Action.HOLD, 0.0, "the gap is not known")
+    if not abs(age) <= parameters.max_age:
+        return Command(Action.HOLD, 0.0, "the estimate is not of now")
     if gap_min >= parameters.instrument_diameter:
         return Command(Action.PASS, 0.0, "the whole interval exceeds the instrument")
     if gap_max >= parameters.largest_gap:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
+from rclpy.time import Time
 from std_msgs.msg import Float64
 
 from knee_gap_bringup.leg_control import Action, Command, LegParameters, decide
@@ -37,7 +38,8 @@ class LegControllerNode(BaseNode):
     def on_gap(self, message: GapEstimate) -> None:
         """Decide on one estimate."""
         valid = message.status == GapEstimate.STATUS_VALID
-        self.command(decide(valid, message.gap_min, message.gap_max, self._parameters))
+        age = (self.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds / 1e9
+        self.command(decide(valid, age, message.gap_min, message.gap_max, self._parameters))
 
     def on_silence(self, _event: object) -> None:
         """Hold the leg: whoever measures the gap is late or dead."""

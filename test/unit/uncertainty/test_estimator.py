@@ -285,3 +285,35 @@ def test_leg_body_that_is_lost_or_elsewhere_is_told() -> None:
         last = run_with_leg(GapEstimator(EstimatorParameters(leg_motion=0.5e-3)), positions, leg_at)[-1]
         assert last.status is GapStatus.TRACKING_LOST
         assert words in last.reason
+
+
+def test_image_that_comes_long_after_its_poses_gives_no_number() -> None:
+    estimator = GapEstimator(EstimatorParameters(max_delay=0.2))
+    positions = list(np.linspace(0.0, 0.006, 60))
+    run(estimator, positions[:50])
+    assert estimator.latest is not None
+    assert estimator.latest.status is GapStatus.VALID
+    late = []
+    for k, x in list(enumerate(positions))[50:]:
+        stamp = 10**9 + k * FRAME_NS
+        estimator.add_pose(pose(stamp - MS, x), stamp)
+        estimator.add_pose(pose(stamp + MS, x), stamp + 2 * MS)
+    for k, x in list(enumerate(positions))[50:]:
+        stamp = 10**9 + k * FRAME_NS
+        late += estimator.add_edges(edges(stamp, x), stamp + 300 * MS)
+    assert {e.status for e in late} == {GapStatus.OUT_OF_SYNC}
+    assert all(math.isnan(e.gap) for e in late)
+
+
+def test_pose_without_an_error_is_refused() -> None:
+    estimator = GapEstimator()
+    estimator.add_pose(replace(pose(10**9, 0.0), covariance=np.zeros((6, 6))), 10**9)
+    assert estimator.counts[f"pose refused: {PoseRefusal.NO_ERROR.value}"] == 1
+
+
+def test_gap_beyond_any_joint_is_no_number() -> None:
+    estimates = run(
+        GapEstimator(EstimatorParameters(largest_gap=0.8 * TRUE_GAP)), list(np.linspace(0, 0.006, 60))
+    )
+    assert not [e for e in estimates if e.status is GapStatus.VALID]
+    assert estimates[-1].status is GapStatus.UNKNOWN
