@@ -46,8 +46,8 @@ class LegParameters:
     max_age: float = field(
         default=0.5,
         metadata={
-            "description": "age of an estimate, by its stamp, above which the leg is held; a bag that is played "
-            "needs --clock and use_sim_time [s]",
+            "description": "age of an estimate, by its stamp, above which the leg is held; a bag that is "
+            "played needs --clock and use_sim_time [s]",
             "range": (0.05, 10.0),
         },
     )
