@@ -95,6 +95,10 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     except ConfigurationError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 2
+    except Exception:
+        # A signal between two looks of the executor ends the context under it, which it takes for an error.
+        if rclpy.ok():
+            raise
     finally:
         if node is not None:
             node.destroy_node()
