@@ -56,8 +56,8 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
             processes.start(node, command)
         processes.wait_ready(list(NODES), START_TIMEOUT)
         topics = [IMAGE, CAMERA_INFO, BODY_POSE]
-        # A second in which the recorder finds the nodes.
-        play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "1"]
+        # Two seconds in which nodes and recorder find each other.
+        play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "2"]
         if rate != 1.0:
             play += ["--clock", "--rate", str(rate)]
         processes.start("play", [*play, "--wait-for", *topics])

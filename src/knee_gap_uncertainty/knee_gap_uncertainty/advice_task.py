@@ -8,8 +8,42 @@ from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, M
 
 # Pieces a turn, each of about a millisecond: at 100 turns a second five pieces of advice are made in one.
 PIECES = 4
+# How much longer than it took the advice rests, where it took long.
+REST = 4
 # Advice is for a hand or a robot that carries a scope: ten times a second is as often as it can be followed.
 PERIOD_NS = 100_000_000
+
+
+class AdvicePace:
+    """How many pieces of advice the next turn of a live node may do, by what the last ones took.
+
+    Most pieces take a fraction of a millisecond, but where two clouds are wide beside their distance one may
+    take twenty: then one at a time, with rests between, so that images are answered in time.
+    """
+
+    def __init__(self, period: float) -> None:
+        """`period` [s] between turns."""
+        self._period = period
+        self._rest = 0
+        self._resting = False
+        self._pieces = PIECES
+
+    def next(self) -> int:
+        """Pieces of this turn; 0 while it is to rest."""
+        self._resting = self._rest > 0
+        if self._resting:
+            self._rest -= 1
+            return 0
+        return self._pieces
+
+    def spent(self, seconds: float) -> None:
+        """Note what the turn took [s]."""
+        if self._resting:
+            return
+        if seconds > self._period / 2:
+            self._pieces, self._rest = 1, int(REST * seconds / self._period)
+        else:
+            self._pieces = min(PIECES, self._pieces + 1)
 
 
 class AdviceTask:
@@ -22,7 +56,7 @@ class AdviceTask:
         self._begun: Situation | None = None
         self._done: tuple[Situation, MotionAdvice] | None = None
 
-    def turn(self, latest: Situation | None) -> MotionAdvice | None:
+    def turn(self, latest: Situation | None, pieces: int = PIECES) -> MotionAdvice | None:
         """Do a few pieces of work; return the advice when it is complete.
 
         `latest` is None where nothing can be advised; work on a track that has ended is dropped.
@@ -35,7 +69,7 @@ class AdviceTask:
             if self._done is not None and latest.stamp_ns - self._done[0].stamp_ns < PERIOD_NS:
                 return None
             self._begun, self._pieces = latest, self._advisor.in_pieces(latest)
-        for _ in range(PIECES):
+        for _ in range(pieces):
             advice = next(self._pieces)
             if advice is not None:
                 assert self._begun is not None

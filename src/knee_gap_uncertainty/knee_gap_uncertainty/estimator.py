@@ -9,7 +9,7 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import NamedTuple
 
-from knee_gap_uncertainty.advice_task import AdviceTask
+from knee_gap_uncertainty.advice_task import PIECES, AdviceTask
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.leg_body import LegBody
@@ -126,10 +126,13 @@ class GapEstimator:
         self._pending.append(Pending(edges, arrival_ns))
         return self._resolve(arrival_ns)
 
-    def advance(self, now_ns: int) -> list[GapEstimate]:
-        """Let time pass; return the estimates that must not wait any longer, and what silence means."""
+    def advance(self, now_ns: int, advice_pieces: int = PIECES) -> list[GapEstimate]:
+        """Let time pass; return the estimates that must not wait any longer, and what silence means.
+
+        `advice_pieces`: how much work on advice may be done meanwhile.
+        """
         self._turn_clock(now_ns)
-        if advice := self._advice_task.turn(self._situation()):
+        if advice := self._advice_task.turn(self._situation(), advice_pieces):
             self.advice.append(advice)
         estimates = self._resolve(now_ns)
         if self._last_edges is None or self._pending:

@@ -1,5 +1,6 @@
 """uncertainty_node: gap_edges and scope_pose in; gap, its bounds, and motion_advice out."""
 
+import time
 from collections.abc import Mapping, Sequence
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -10,6 +11,7 @@ from std_msgs.msg import Float64
 from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
+from knee_gap_uncertainty.advice_task import AdvicePace
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.motion_advice import AdviceParameters
@@ -49,11 +51,14 @@ class UncertaintyNode(BaseNode):
             depth=8, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability
         )
         self.create_subscription(ScopeCalibration, "scope_calibration", self.on_calibration, calibration_qos)
+        self._pace = AdvicePace(TICK)
         self._tick = self.create_timer(TICK, self.on_tick)
 
     def on_tick(self) -> None:
         """Let time pass: estimates that must not wait any longer, and advice that has become ready."""
-        self.publish(self._estimator.advance(self.now_ns()))
+        began = time.perf_counter()
+        self.publish(self._estimator.advance(self.now_ns(), self._pace.next()))
+        self._pace.spent(time.perf_counter() - began)
         while self._estimator.advice:
             advice = self._estimator.advice.popleft()
             message = messages.fill_motion_advice(MotionAdvice(), advice, self._advice_parameters)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from knee_gap_uncertainty.advice_task import PIECES, AdvicePace
 from knee_gap_uncertainty.errors import BadInputError
 from knee_gap_uncertainty.gap_range import gap_range
 from knee_gap_uncertainty.motion_advice import (
@@ -152,3 +153,16 @@ def test_points_one_behind_the_other_have_no_direction_along_the_gap() -> None:
 def test_settings_are_refused(bad: dict[str, object]) -> None:
     with pytest.raises(BadInputError, match=next(iter(bad))):
         AdviceParameters(**bad)  # type: ignore[arg-type]
+
+
+def test_advice_that_takes_long_rests_and_comes_back():
+    pace = AdvicePace(0.01)
+    assert pace.next() == PIECES
+    pace.spent(0.08)
+    turns = []
+    for _ in range(40):
+        turns.append(pace.next())
+        pace.spent(0.0)
+    # Eight turns' time was taken: four times as long nothing is done, then one piece, then more again.
+    assert turns[:32] == [0] * 32
+    assert turns[32:36] == [1, 2, 3, 4]
