@@ -109,16 +109,6 @@ class HandEye:
         enough = len(rms) >= OUTLYING_VIEWS and worst.mean() <= 0.2
         return worst if enough else np.zeros(len(rms), dtype=bool)
 
-    @property
-    def position_sigma(self) -> Array:
-        """Standard deviation (3,) [m] of the lens position, in the lens frame."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
-
-    @property
-    def rotation_sigma(self) -> Array:
-        """Standard deviation (3,) [rad] of the lens rotation, in the lens frame."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
-
 
 def calibrate_hand_eye(
     views: Sequence[TrackedView],

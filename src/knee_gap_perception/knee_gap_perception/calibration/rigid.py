@@ -54,18 +54,6 @@ def skew(vectors: npt.ArrayLike) -> Array:
     return result
 
 
-def right_jacobian(rotation_vector: npt.ArrayLike) -> Array:
-    """J (3, 3) with exp(v + dv) = exp(v) exp(J dv) to first order in dv (Chirikjian, SO(3))."""
-    v = np.asarray(rotation_vector, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
-    K = skew(v)
-    if angle < 1e-6:
-        return np.asarray(np.eye(3) - K / 2)
-    return np.asarray(
-        np.eye(3) - (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * (K @ K)
-    )
-
-
 def angle_between(T_a: npt.ArrayLike, T_b: npt.ArrayLike) -> float:
     """Angle [rad] of the rotation between two transforms (4, 4) or rotation matrices (3, 3)."""
     difference = np.asarray(T_a)[:3, :3].T @ np.asarray(T_b)[:3, :3]
