@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import norm
 
+from knee_gap_uncertainty.common_offset import Bend
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.curved_test import radius_at
 from knee_gap_uncertainty.distance_extremes import largest_distance, smallest_distance
@@ -52,7 +53,7 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
     if not 0.0 < level < 1.0:
         raise BadInputError(f"the confidence level must lie inside (0, 1), not {level!r}")
     lower, upper = interval_ends(
-        fit.frames, fit.unknowns, fit.unknowns_covariance, float(norm.ppf(0.5 + 0.5 * level))
+        fit.frames, fit.unknowns, fit.unknowns_covariance, float(norm.ppf(0.5 + 0.5 * level)), fit.bend
     )
     variation = fit.inverse_depth_variation
     if not variation <= LARGEST_INVERSE_DEPTH_VARIATION:
@@ -65,12 +66,26 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
 
 
 @compiled
-def interval_ends(frames: Array, unknowns: Array, covariance: Array, radius: float) -> tuple[float, float]:
+def interval_ends(
+    frames: Array, unknowns: Array, covariance: Array, radius: float, bend: Bend
+) -> tuple[float, float]:
     """Lower and upper end [m] at the level whose two-sided normal deviate is `radius`.
 
-    `unknowns` (2, 3) and `covariance` (6, 6) as in MultiViewFit. The upper end is infinite where the
+    `unknowns` (2, 3), `covariance` (6, 6) and `bend` as in MultiViewFit. The upper end is infinite where the
     ellipsoid reaches an inverse depth of 0.
     """
+    lower, upper = _ends_of_ellipsoid(frames, unknowns, covariance, radius * bend.widening)
+    move = bend.mean + (radius * radius - 1.0) * bend.skew
+    # The ellipsoid that holds two points at one place says nothing of how far they are apart at least.
+    lower = max(lower + move, 0.0) if lower > 0.0 else 0.0
+    return lower, max(upper + move, lower)
+
+
+@compiled
+def _ends_of_ellipsoid(
+    frames: Array, unknowns: Array, covariance: Array, radius: float
+) -> tuple[float, float]:
+    """Ends [m] over the ellipsoid, by the test that knows how curved the distance is there."""
     root = np.zeros((6, 6))
     if not cholesky(covariance, root):
         return 0.0, np.inf

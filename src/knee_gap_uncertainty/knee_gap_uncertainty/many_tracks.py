@@ -54,7 +54,7 @@ def fit_all(
             axes,
             common_share,
         )
-        ends = interval_ends(fitted.frames, fitted.unknowns, fitted.covariance, radius)
+        ends = interval_ends(fitted.frames, fitted.unknowns, fitted.covariance, radius, fitted.bend)
         result[1, run], result[2, run], result[3, run] = ends[0], ends[1], np.inf
         if fitted.unknowns[0, 2] > 0.0 and fitted.unknowns[1, 2] > 0.0:
             squared = 0.0

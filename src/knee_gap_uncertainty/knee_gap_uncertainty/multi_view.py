@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_uncertainty.common_offset import STRAIGHT, Bend, bend_of_gap, is_large
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
 from knee_gap_uncertainty.likelihood import (
@@ -66,6 +67,7 @@ class Fitted(NamedTuple):
     chi_square_ratio: float
     scale: float
     shares: Array
+    bend: Bend
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class MultiViewFit:
     the errors are as they were said to be; `scale` >= 1: what the covariances were multiplied by because of
     it. `used` (N, 2) is false for gated bearings; `residuals` (N, 2): their squared length in standard
     deviations. `shares` (4,): image, lens position, lens rotation and common part of the variance of the gap;
-    they sum to 1, and are NaN where there is no gap.
+    they sum to 1, and are NaN where there is no gap. `bend`: how far a large common offset moves
+    the ends of the gap's interval.
     """
 
     points: Array
@@ -94,6 +97,7 @@ class MultiViewFit:
     used: Mask
     residuals: Array
     shares: Array
+    bend: Bend = STRAIGHT
 
     @property
     def view_count(self) -> int:
@@ -152,6 +156,7 @@ def fit(views: Views) -> MultiViewFit:
         used=fitted.used,
         residuals=fitted.residuals,
         shares=fitted.shares,
+        bend=fitted.bend,
     )
 
 
@@ -226,7 +231,11 @@ def fit_arrays(
         allowed -= gated
         cost = maximise(measured, used, unknowns, out, inverse)
     covariance = np.zeros((6, 6))
-    expected = considered_covariance(out, share, inverse, covariance)
+    slopes = np.zeros((6, 4))
+    expected = considered_covariance(out, share, inverse, covariance, slopes)
+    bend = STRAIGHT
+    if is_large(measured, used, out, share) and not is_depth_lost(unknowns, out):
+        bend = bend_of_gap(measured, used, out, share, inverse, slopes, unknowns, covariance)
     if count >= FEWEST_VIEWS_TO_GATE:
         covariance *= price_of_gate(share)
     shares = variance_shares(measured, out, unknowns, share, inverse)
@@ -239,13 +248,14 @@ def fit_arrays(
         ramp = ((ratio - 1.0) * np.sqrt(0.5 * dof) - SCALE_RAMP[0]) / (SCALE_RAMP[1] - SCALE_RAMP[0])
         scale += min(max(ramp, 0.0), 1.0) * (ratio - 1.0)
         covariance *= scale
-    if is_depth_lost(unknowns, out) or not cholesky(covariance, np.zeros((6, 6))):
+    is_lost = is_depth_lost(unknowns, out) or not bend.is_bounded
+    if is_lost or not cholesky(covariance, np.zeros((6, 6))):
         for row in range(6):
             for column in range(6):
                 covariance[row, column] = 1.0 if row == column else 0.0
         for n in range(2):
             covariance[3 * n + 2, 3 * n + 2] = 1.0 / FLAT_PRIOR + (10.0 * unknowns[n, 2]) ** 2
-    return Fitted(centre, measured.frames, unknowns, covariance, used, residuals, ratio, scale, shares)
+    return Fitted(centre, measured.frames, unknowns, covariance, used, residuals, ratio, scale, shares, bend)
 
 
 @compiled

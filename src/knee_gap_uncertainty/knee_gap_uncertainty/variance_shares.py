@@ -16,7 +16,9 @@ Array = npt.NDArray[np.float64]
 
 
 @compiled
-def considered_covariance(out: Linearised, common_share: float, inverse: Array, covariance: Array) -> float:
+def considered_covariance(
+    out: Linearised, common_share: float, inverse: Array, covariance: Array, slopes: Array
+) -> float:
     """Write the covariance (6, 6) of the unknowns with a common part of the bearings' errors.
 
     With H the information, H'^-1 the `inverse` of the corrected one and h_i = J_i^T W_i K_i, where K_i K_i^T
@@ -24,7 +26,9 @@ def considered_covariance(out: Linearised, common_share: float, inverse: Array, 
 
         C = H'^-1 (H + sum_i h_i sum_i h_i^T - sum_i h_i h_i^T) H'^-1.
 
-    Returns the expected sum of squared weighted residuals, 4 N - 6 where nothing is common.
+    Writes also the `slopes` (6, 4) of the unknowns by the common offset, two parts of each point in their
+    deviations: H'^-1 sum_i h_i. Returns the expected sum of squared weighted residuals, 4 N - 6
+    where nothing is common.
     """
     total = np.zeros((6, 4))
     spread = np.zeros((6, 6))
@@ -70,6 +74,10 @@ def considered_covariance(out: Linearised, common_share: float, inverse: Array, 
             covariance[row, column] = 0.0
             for k in range(6):
                 covariance[row, column] += through[row, k] * inverse[k, column]
+        for column in range(4):
+            slopes[row, column] = 0.0
+            for k in range(6):
+                slopes[row, column] += inverse[row, k] * total[k, column]
     return float(max(expected, 0.0))
 
 

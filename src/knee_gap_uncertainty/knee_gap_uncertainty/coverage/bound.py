@@ -50,7 +50,7 @@ def bound(cell: Cell) -> Bound:
     linearise(measured, np.ones((count, 2), dtype=np.bool_), unknowns, out)
     inverse = np.linalg.inv(out.information)
     considered = np.zeros((6, 6))
-    considered_covariance(out, SHARES[cell.share], inverse, considered)
+    considered_covariance(out, SHARES[cell.share], inverse, considered, np.zeros((6, 4)))
     gradient = gap_gradient(frames, unknowns)
     jacobian = points_jacobian(frames, unknowns)
     place = jacobian @ considered @ jacobian.T
