@@ -33,6 +33,8 @@ RECORDED = (
 RECORDING = "gap.mcap"
 # Time the nodes have to come up: the first start after a build compiles the kernels.
 START_TIMEOUT = 120.0
+# The longest that segmentation_node lets an image wait for the pose after it [s].
+LONGEST_POSE_WAIT = 0.1
 # Time for the last image to pass through the nodes and into the recording [s].
 DRAIN = 1.0
 
@@ -53,6 +55,9 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
                 command += ["--params-file", str(bag / PARAMETERS_FILE)]
             if node == "segmentation_node":
                 command += ["-p", "image_transport:=compressed"]
+                if rate < 1.0:
+                    # Played slowly so that nothing is lost: then no pose shall come too late either.
+                    command += ["-p", f"max_pose_wait:={LONGEST_POSE_WAIT}"]
             processes.start(node, command)
         processes.wait_ready(list(NODES), START_TIMEOUT)
         topics = [IMAGE, CAMERA_INFO, BODY_POSE]
