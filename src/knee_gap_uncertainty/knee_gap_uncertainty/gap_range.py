@@ -86,9 +86,9 @@ def gap_range(
     shifts = displacements(shift, radii)
     ranges = []
     if apex != "second":
-        ranges.append(range_from_apex(points.gap_first, views, psi, shifts, signs))
+        ranges.append(range_from_apex(points.points_first, views, psi, shifts, signs))
     if apex != "first":
-        ranges.append(range_from_apex(points.gap_second, reversed_views(views), psi, shifts, signs))
+        ranges.append(range_from_apex(points.points_second, reversed_views(views), psi, shifts, signs))
     best = max(ranges, key=lambda found: (found.snr, found.gap_min))
     lowest = min(found.gap_min for found in ranges)
     if interval == "worst_case" and lowest < FAR_NEARER * best.gap_min:
@@ -97,20 +97,39 @@ def gap_range(
 
 
 def range_from_apex(
-    gap: float,
+    points: npt.NDArray[np.float64],
     views: TwoViews,
     angular_error: float,
     shifts: npt.NDArray[np.float64],
     signs: npt.NDArray[np.float64],
 ) -> GapRange:
-    """Range of a gap [m] by the clouds of the rays of the first lens of `views`."""
+    """Range of the gap between `points` (2, 3) [m] by the clouds of the rays of the first lens of `views`."""
+    gap = float(np.linalg.norm(points[1] - points[0]))
     if angular_error == 0 and not shifts.any():
         return GapRange(gap, gap, gap, math.inf)
+    # With axes along the gap a box reaches along it no farther than its points: more boxes are skipped.
+    turn = axes_along(points[1] - points[0])
     gap_min, gap_max, smallest_angle = cloud_range(
-        views.travel, views.bearings_0, views.bearings_1, angular_error, shifts, signs
+        turn @ views.travel,
+        views.bearings_0 @ turn.T,
+        views.bearings_1 @ turn.T,
+        angular_error,
+        shifts @ turn.T,
+        signs,
     )
     refuse_parallel(smallest_angle)
     return ranged(gap, gap_min, gap_max)
+
+
+def axes_along(direction: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Right-handed axes (3, 3), in rows, the first along `direction` (3,); any axes where it is zero."""
+    length = float(np.linalg.norm(direction))
+    if not length > 0:
+        return np.eye(3)
+    first = direction / length
+    second = np.cross(np.eye(3)[np.argmin(np.abs(first))], first)
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
 
 
 def ranged(gap: float, gap_min: float, gap_max: float) -> GapRange:
