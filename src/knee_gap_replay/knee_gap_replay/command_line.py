@@ -6,7 +6,8 @@ import math
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NoReturn, TypeVar
 
 from tqdm import tqdm
@@ -15,6 +16,7 @@ from knee_gap_node.errors import ConfigurationError
 from knee_gap_replay.errors import BagError
 
 Item = TypeVar("Item")
+_SECONDS_BETWEEN_LINES = 10.0
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,6 +51,8 @@ def run(
 ) -> int:
     """Parse, run the command, and return its exit code; 1 and one line for a mistake."""
     arguments = parser.parse_args(argv)
+    # Ended from outside, a command still closes what it writes; those that end by themselves set their own.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
     try:
         return command(arguments)
@@ -56,15 +60,22 @@ def run(
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        print(f"{parser.prog}: stopped before the end", file=sys.stderr)
         return 130
 
 
-def with_progress(messages: Iterable[Item], total: int | None) -> Iterable[Item]:
-    """Return the messages, with a bar on a terminal while they are taken."""
-    bar: Iterable[Item] = tqdm(
-        messages, total=total, unit=" messages", disable=not sys.stderr.isatty(), leave=False
-    )
-    return bar
+def with_progress(messages: Iterable[Item], total: int | None) -> Iterator[Item]:
+    """Yield the messages: with a bar on a terminal, elsewhere with a line now and then."""
+    if sys.stderr.isatty():
+        yield from tqdm(messages, total=total, unit=" messages", leave=False)
+        return
+    told = time.monotonic()
+    for count, message in enumerate(messages):
+        if time.monotonic() - told > _SECONDS_BETWEEN_LINES:
+            told = time.monotonic()
+            share = f" ({100 * count // total} %)" if total else ""
+            print(f"{count} messages{share}", file=sys.stderr, flush=True)
+        yield message
 
 
 def stop_on_signals() -> threading.Event:

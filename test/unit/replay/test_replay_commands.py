@@ -1,10 +1,11 @@
 """process and check as a user meets them: one line for a mistake, and exit codes that a script can use."""
 
+import signal
 from pathlib import Path
 
 import pytest
 
-from knee_gap_replay import check, process
+from knee_gap_replay import check, command_line, process, processing
 from knee_gap_replay.bag import BagReader, BagWriter
 from knee_gap_replay.types import blank
 
@@ -114,3 +115,34 @@ def test_check_refuses_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "x.mcap").write_text("not a bag, but long enough to look at")
     assert check.main([str(tmp_path / "x.mcap")]) == 1
     assert "is not an MCAP file" in told(capsys)
+
+
+def test_process_that_is_ended_leaves_a_bag_that_opens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag, out = write(tmp_path / "bag"), tmp_path / "out"
+    (bag / "scope.yaml").write_text(SCOPE)
+    begun = processing.process
+
+    def ended_in_the_middle(reader: BagReader, writer: BagWriter, pipeline: processing.Pipeline) -> None:
+        begun(reader, writer, pipeline)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(process, "process", ended_in_the_middle)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert process.main([str(bag), str(out)]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert told(capsys) == "process: stopped before the end\n"
+    with BagReader(out) as reader:
+        assert len(list(reader.messages(["/knee_gap/gap_edges"]))) == 50
+        assert not reader.losses
+
+
+def test_long_work_tells_how_far_it_is_off_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command_line, "_SECONDS_BETWEEN_LINES", -1.0)
+    assert list(command_line.with_progress(range(4), 4)) == [0, 1, 2, 3]
+    assert capsys.readouterr().err.splitlines()[1] == "1 messages (25 %)"
