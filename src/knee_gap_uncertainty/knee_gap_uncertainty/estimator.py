@@ -75,15 +75,15 @@ class GapEstimator:
         """What the advice aims at."""
         return self._advice_task.parameters
 
-    def add_pose(self, pose: LensPose, arrival_ns: int) -> list[GapEstimate]:
-        """Take a lens pose; return the estimates that it made possible."""
+    def add_pose(self, pose: LensPose, arrival_ns: int, queued_ns: int = 0) -> list[GapEstimate]:
+        """Take a lens pose, which had lain in a queue; return the estimates that it made possible."""
         self._turn_clock(arrival_ns)
         refusal = self._poses.add(pose)
         if refusal is not None:
             self.counts[f"pose refused: {refusal.value}"] += 1
         else:
             self._frame_id = pose.frame_id
-            self._pose_delays_ns.append(arrival_ns - pose.stamp_ns)
+            self._pose_delays_ns.append(arrival_ns - queued_ns - pose.stamp_ns)
         return self._resolve(arrival_ns)
 
     def add_leg_pose(self, pose: LensPose) -> None:

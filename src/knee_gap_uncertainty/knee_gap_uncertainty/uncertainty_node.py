@@ -68,9 +68,20 @@ class UncertaintyNode(BaseNode):
         """Estimate at an image."""
         self.publish(self._estimator.add_edges(messages.edges_from_message(message), self.now_ns()))
 
-    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def on_pose(self, message: PoseWithCovarianceStamped, info: Mapping[str, int | None]) -> None:
         """Take a lens pose, which may complete images that waited for it."""
-        self.publish(self._estimator.add_pose(messages.pose_from_message(message), self.now_ns()))
+        pose, queued_ns = messages.pose_from_message(message), self.queued_ns(info)
+        self.publish(self._estimator.add_pose(pose, self.now_ns(), queued_ns))
+
+    def queued_ns(self, info: Mapping[str, int | None]) -> int:
+        """How long a message lay in this node's queue: where poses and images lie alike, both are late.
+
+        Zero by a bag's clock, which tells nothing of it.
+        """
+        received_ns = info.get("received_timestamp")
+        if not received_ns or self.get_clock().ros_time_is_active:
+            return 0
+        return max(time.time_ns() - received_ns, 0)
 
     def on_leg_pose(self, message: PoseStamped) -> None:
         """Take a pose of a body fixed to the leg, which must not move within a track."""

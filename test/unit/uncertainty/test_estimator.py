@@ -305,6 +305,21 @@ def test_image_that_comes_long_after_its_poses_gives_no_number() -> None:
     assert all(math.isnan(e.gap) for e in late)
 
 
+def test_backlog_of_poses_and_images_alike_gives_no_number() -> None:
+    """Both lay in the node's queue: by their stamps alone neither is later than the other."""
+    estimator = GapEstimator(EstimatorParameters(max_delay=0.2))
+    positions = list(np.linspace(0.0, 0.006, 60))
+    run(estimator, positions[:50])
+    late = []
+    for k, x in list(enumerate(positions))[50:]:
+        stamp, queued = 10**9 + k * FRAME_NS, 300 * MS
+        late += estimator.add_pose(pose(stamp - MS, x), stamp + queued, queued)
+        late += estimator.add_edges(edges(stamp, x), stamp + queued)
+        late += estimator.add_pose(pose(stamp + MS, x), stamp + queued + 2 * MS, queued)
+    assert len(late) == 10
+    assert {e.status for e in late} == {GapStatus.OUT_OF_SYNC}
+
+
 def test_pose_without_an_error_is_refused() -> None:
     estimator = GapEstimator()
     estimator.add_pose(replace(pose(10**9, 0.0), covariance=np.zeros((6, 6))), 10**9)
