@@ -1,6 +1,6 @@
 """The pipeline of a bag: the tracked body and the edges of two known points give their known distance."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ from knee_gap_replay.processing import Output
 from knee_gap_replay.topics import InputTopics
 from knee_gap_replay.types import blank
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +26,7 @@ POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
 GAP = float(np.linalg.norm(POINTS[0] - POINTS[1]))
 POSE_PERIOD_NS = 8_333_333
 TRACKING = TrackingParameters(body_to_shaft_translation=(0.0, 0.01, 0.2), oblique_angle=0.5)
-VALID, TRACKING_LOST, INSUFFICIENT_PARALLAX = 1, 3, 4
+VALID, TRACKING_LOST, INSUFFICIENT_PARALLAX, JOINT_MOVED = 1, 3, 4, 6
 
 
 def lens_pose(stamp_ns: int) -> Array:
@@ -94,15 +95,29 @@ def body(stamp_ns: int) -> Any:
     return message
 
 
-def run(end_ns: int, poses_until_ns: int) -> list[Output]:
+def leg(stamp_ns: int, moved: float) -> Any:
+    message = stamped("geometry_msgs/msg/PoseStamped", stamp_ns)
+    message.header.frame_id = "world"
+    # At rest as well a tracker's numbers change in their last digits.
+    message.pose.position.x, message.pose.orientation.w = moved + 1e-15 * stamp_ns, 1.0
+    return message
+
+
+def run(
+    end_ns: int, poses_until_ns: int, leg_at: Callable[[int], float | None] | None = None
+) -> list[Output]:
+    """Outputs for a scope tracked until a stamp; `leg_at`: where the leg body is, None where it is lost."""
+    parameters = EstimatorParameters(leg_motion=0.5e-3 if leg_at else 0.0)
     pipeline = GapPipeline(
-        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
+        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(parameters), TOPICS, "/space"
     )
     outputs = list(pipeline.feed("/camera_info", stamped("sensor_msgs/msg/CameraInfo", 0), 0))
     for index in range(end_ns // POSE_PERIOD_NS):
         stamp_ns = index * POSE_PERIOD_NS
         if stamp_ns <= poses_until_ns:
             outputs += pipeline.feed("/body", body(stamp_ns), stamp_ns)
+        if leg_at is not None and (moved := leg_at(stamp_ns)) is not None:
+            outputs += pipeline.feed("/space/leg_body/pose", leg(stamp_ns, moved), stamp_ns)
         if index % 2 == 0:
             image_ns = stamp_ns + 1_000_000
             outputs += pipeline.feed("/image", stamped("sensor_msgs/msg/CompressedImage", image_ns), image_ns)
@@ -129,6 +144,30 @@ def test_plain_numbers_repeat_the_valid_estimates_and_no_others() -> None:
     valid = [gap for gap in on(outputs, "/space/gap") if gap.status == VALID]
     for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr")):
         assert [m.data for m in on(outputs, f"/space/gap/{topic}")] == [getattr(gap, name) for gap in valid]
+
+
+def test_a_leg_body_that_moves_ends_the_track_and_one_that_rests_changes_nothing() -> None:
+    end_ns, moves_ns = 3_000_000_000, 2_000_000_000
+    alone, rests, moves = (
+        on(run(end_ns, end_ns, leg_at), "/space/gap")
+        for leg_at in (None, lambda _: 0.0, lambda stamp_ns: 2e-3 if stamp_ns >= moves_ns else 0.0)
+    )
+    assert [gap.gap for gap in rests if gap.status == VALID] == [
+        gap.gap for gap in alone if gap.status == VALID
+    ]
+    first = next(index for index, gap in enumerate(moves) if gap.status == JOINT_MOVED)
+    stamps = [gap.header.stamp.sec * 10**9 + gap.header.stamp.nanosec for gap in moves]
+    assert moves_ns <= stamps[first] < moves_ns + 3 * POSE_PERIOD_NS
+    # What was seen before the move is no part of the new track.
+    assert moves[first + 1].status == INSUFFICIENT_PARALLAX
+    assert moves[first + 1].view_count == 1
+
+
+def test_a_leg_body_that_is_lost_leaves_no_number() -> None:
+    end_ns, lost_ns = 2_500_000_000, 2_000_000_000
+    gaps = on(run(end_ns, end_ns, lambda stamp_ns: None if stamp_ns > lost_ns else 0.0), "/space/gap")
+    assert gaps[110].status == VALID
+    assert {gap.status for gap in gaps[-20:]} == {TRACKING_LOST}
 
 
 def test_lens_poses_are_those_of_the_body_with_the_lens_on_it() -> None:
