@@ -47,9 +47,9 @@ class Client:
         """Publish one message."""
         self._outlets[topic].publish(message)
 
-    def offer(self, kind: type, topic: str) -> None:
+    def offer(self, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> None:
         """Announce a topic to publish on."""
-        self._outlets[topic] = self.node.create_publisher(kind, topic, RELIABLE)
+        self._outlets[topic] = self.node.create_publisher(kind, topic, qos)
 
     def spin(self, seconds: float) -> None:
         """Take what comes for a while."""

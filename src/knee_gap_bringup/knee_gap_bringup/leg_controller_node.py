@@ -1,5 +1,6 @@
 """leg_controller_node: an example subscriber of gap that moves nothing unless the gap is known."""
 
+import time
 from collections.abc import Mapping, Sequence
 
 from rclpy.duration import Duration
@@ -7,8 +8,9 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
 
-from knee_gap_bringup.leg_control import Action, Command, LegParameters, decide
+from knee_gap_bringup.leg_control import Action, Command, Estimate, LegControl, LegParameters
 from knee_gap_msgs.msg import GapEstimate
 from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
 
@@ -18,14 +20,15 @@ class LegControllerNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("leg_controller_node", health=self.health)
-        self._parameters = self.declare(LegParameters)
+        self._control = LegControl(self.declare(LegParameters))
         self.refuse_unknown_parameters()
         self._command = Command(Action.HOLD, 0.0, "no estimate received yet")
+        self._measure_anew = self.create_client(Trigger, "start_anew")
         self._rate = self.create_publisher(Float64, "leg/opening_rate", RESULT_QOS)
         qos = QoSProfile(
             depth=1,
             reliability=RESULT_QOS.reliability,
-            deadline=Duration(nanoseconds=int(self._parameters.deadline * 1e9)),
+            deadline=Duration(nanoseconds=int(self._control.parameters.deadline * 1e9)),
         )
         self.create_subscription(
             GapEstimate,
@@ -39,17 +42,21 @@ class LegControllerNode(BaseNode):
         """Decide on one estimate."""
         valid = message.status == GapEstimate.STATUS_VALID
         age = (self.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds / 1e9
-        self.command(decide(valid, age, message.gap_min, message.gap_max, self._parameters))
+        estimate = Estimate(valid, message.track_id, age, message.gap_min, message.gap_max)
+        self.command(self._control.on_estimate(estimate, time.monotonic()))
 
     def on_silence(self, _event: object) -> None:
         """Hold the leg: whoever measures the gap is late or dead."""
-        self.command(Command(Action.HOLD, 0.0, "no estimate within the deadline"))
+        self.command(self._control.on_silence(time.monotonic()))
 
     def command(self, command: Command) -> None:
         """Publish a command, and say so when the action changes."""
         if command.action is not self._command.action:
             self.get_logger().info(f"{command.action}: {command.reason}")
         self._command = command
+        if command.measure_anew:
+            # Without an answer the leg is held: the old track is not believed any more.
+            self._measure_anew.call_async(Trigger.Request())
         self._rate.publish(Float64(data=command.opening_rate))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:

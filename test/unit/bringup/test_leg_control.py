@@ -4,9 +4,11 @@ import math
 
 import pytest
 
-from knee_gap_bringup.leg_control import Action, LegParameters, decide
+from knee_gap_bringup.leg_control import Action, Estimate, LegControl, LegParameters, decide
 
 PARAMETERS = LegParameters(instrument_diameter=0.004, largest_gap=0.012)
+NARROW = Estimate(is_valid=True, track_id=1, age=0.05, gap_min=0.0039, gap_max=0.006)
+WIDE = NARROW._replace(gap_min=0.0045)
 
 
 @pytest.mark.parametrize(
@@ -20,24 +22,24 @@ PARAMETERS = LegParameters(instrument_diameter=0.004, largest_gap=0.012)
     ],
 )
 def test_holds_on_what_is_not_known_or_at_the_limit(valid: bool, gap_min: float, gap_max: float) -> None:
-    command = decide(valid, 0.05, gap_min, gap_max, PARAMETERS)
+    command = decide(Estimate(valid, 1, 0.05, gap_min, gap_max), PARAMETERS)
     assert command.action is Action.HOLD
     assert command.opening_rate == 0.0
 
 
 def test_opens_while_the_lower_bound_is_too_small() -> None:
-    command = decide(True, 0.05, 0.0039, 0.006, PARAMETERS)
+    command = decide(NARROW, PARAMETERS)
     assert command.action is Action.OPEN
     assert command.opening_rate == PARAMETERS.opening_rate
 
 
 def test_passes_on_the_lower_bound_not_on_the_estimate() -> None:
-    assert decide(True, 0.05, 0.004, 0.02, PARAMETERS).action is Action.PASS
+    assert decide(NARROW._replace(gap_min=0.004, gap_max=0.02), PARAMETERS).action is Action.PASS
 
 
 @pytest.mark.parametrize("age", [0.6, -0.6, math.nan])
 def test_holds_on_an_estimate_that_is_not_of_now(age: float) -> None:
-    command = decide(True, age, 0.005, 0.006, PARAMETERS)
+    command = decide(NARROW._replace(age=age), PARAMETERS)
     assert command.action is Action.HOLD
     assert command.opening_rate == 0.0
 
@@ -45,3 +47,30 @@ def test_holds_on_an_estimate_that_is_not_of_now(age: float) -> None:
 def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(ValueError, match="must exceed instrument_diameter"):
         LegParameters(instrument_diameter=0.013, largest_gap=0.012)
+
+
+def test_opens_by_a_step_and_believes_only_a_track_begun_at_rest() -> None:
+    control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
+    # While the joint moves nothing that is measured counts, not even that the instrument fits.
+    assert control.on_estimate(WIDE, 0.4).action is Action.OPEN
+    assert control.on_estimate(WIDE, 0.5).action is Action.HOLD
+    during = WIDE._replace(track_id=2)
+    assert control.on_estimate(during, 0.7).action is Action.HOLD
+    at_rest = control.on_estimate(during, 0.85)
+    assert at_rest.action is Action.HOLD
+    assert at_rest.measure_anew
+    assert control.on_estimate(during, 1.0).action is Action.HOLD
+    assert not control.on_estimate(during, 1.1).measure_anew
+    anew = WIDE._replace(track_id=3)
+    assert control.on_estimate(anew, 2.0).action is Action.PASS
+    assert control.on_estimate(NARROW._replace(track_id=3), 2.1).action is Action.OPEN
+
+
+def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
+    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
+    assert control.on_silence(0.2).opening_rate == 0.0
+    assert control.on_estimate(NARROW, 0.3).action is Action.HOLD
+    assert control.on_estimate(NARROW, 0.6).measure_anew
+    assert control.on_estimate(NARROW, 0.7).action is Action.HOLD
