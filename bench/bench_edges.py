@@ -11,9 +11,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from kept_frames import frames_of
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
@@ -125,14 +127,14 @@ def lens_pose(frame: BenchFrame) -> LensPose:
     return LensPose(frame.stamp_ns, "world", "arthroscope_optical", T[:3, 3], quaternion, covariance)
 
 
-def score(bench: Bench, *, posed: bool) -> Scores:
+def score(bench: Bench, *, posed: bool, keep: Path | None = None) -> Scores:
     """Run the detector over a bench and score every image."""
     lens = bench.lens
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
     detector, scores, check, track, points = GapEdgeDetector(), Scores(), GapCheck(), 0, None
-    for frame in bench.frames():
+    for frame in frames_of(bench, keep):
         pose = lens_pose(frame)
         edges = detector.process(frame.stamp_ns, frame.image, camera, pose if posed else None)
         if frame.index % 10 == 0:
@@ -189,6 +191,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=1.0, help="of every track; the travel takes 3.3 s")
     parser.add_argument("--fps", type=float, default=15.0)
     parser.add_argument("--without-pose", action="store_true", help="follow the points by the images alone")
+    parser.add_argument("--keep", type=Path, help="folder to keep rendered images in and take them from")
     asked = parser.parse_args(argv)
     for direction in asked.travel_direction:
         for level in asked.level:
@@ -199,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 except SimulationError as error:
                     print(f"bench_edges: {error}", file=sys.stderr)
                     return 1
-                total.add(score(bench, posed=not asked.without_pose))
+                total.add(score(bench, posed=not asked.without_pose, keep=asked.keep))
             print(f"level {level} {direction:8s} {total.line()}", flush=True)
     return 0
 

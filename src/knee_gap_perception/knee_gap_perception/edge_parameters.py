@@ -53,7 +53,7 @@ class EdgeParameters:
         metadata={"description": "Radius of that region, against the field of view's", "range": (0.02, 2.0)},
     )
     inset: float = field(
-        default=0.030,
+        default=0.035,
         metadata={
             "description": "Angle by which the points lie inside the edges, on the tissue [rad]",
             "range": (0.005, 0.2),

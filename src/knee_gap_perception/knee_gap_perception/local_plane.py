@@ -46,11 +46,15 @@ class View:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A patch in a new image: its warp, its parameters' covariance (6, 6) and change with m (6, 3)."""
+    """A patch in a new image: its warp, its parameters' covariance (6, 6) and change with m (6, 3).
+
+    `parallax` (2,) [px]: how far it has moved because the lens did, and not by a turn of it.
+    """
 
     warp: Warp
     covariance: Array
     jacobian: Array
+    parallax: Array
 
 
 class LocalPlane:
@@ -75,7 +79,9 @@ class LocalPlane:
         planes = self.mean + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         seen = np.stack([self._see(plane, bearings, anchor, view) for plane in planes])
         pixels = camera.pixels(seen)
-        if not np.isfinite(pixels).all():
+        turned = bearings[0] @ anchor.T_world_lens[:3, :3].T @ view.T_world_lens[:3, :3]
+        parallax = pixels[0, 0] - camera.pixels(turned)
+        if not (np.isfinite(pixels).all() and np.isfinite(parallax).all()):
             return None
         shape_x = (pixels[:, 1] - pixels[:, 2]) / (2 * DIFFERENCE)
         shape_y = (pixels[:, 3] - pixels[:, 4]) / (2 * DIFFERENCE)
@@ -84,7 +90,7 @@ class LocalPlane:
         jacobian = ((parameters[1:4] - parameters[4:7]) / (2 * step)).T
         noise = self._pose_noise(camera, parameters[0, :2], anchor, view)
         covariance = jacobian @ self.covariance @ jacobian.T + noise
-        return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian)
+        return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian, parallax)
 
     def learn(self, prediction: Prediction, found: Array, covariance: Array, view: View) -> None:
         """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction.

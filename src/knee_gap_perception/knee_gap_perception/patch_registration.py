@@ -22,7 +22,7 @@ Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
-ONE_SIDED, FULL_SIDED = 0.55, 0.85  # share of that window on the surface: from no weight to full
+ONE_SIDED, FULL_SIDED = 0.75, 0.97  # share of that window on the surface: from no weight to full
 SMOOTHING = 1.3  # [px] standard deviation: what is finer is noise
 FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
 NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
@@ -81,8 +81,12 @@ def surface_around(
     half_size: int,
     dark_below: float,
     field_mask: npt.NDArray[np.bool_] | None = None,
+    stretch: tuple[float, float] = (1.0, 1.0),
 ) -> Surface:
-    """Texture and weight of the square around a pixel of an image (h, w); none outside the image."""
+    """Texture and weight of the square around a pixel of an image (h, w); none outside the image.
+
+    `stretch` [-] is that of the window of the local mean and contrast, along columns and rows.
+    """
     column, row = int(np.floor(centre[0])) - half_size, int(np.floor(centre[1])) - half_size
     side = 2 * half_size + 1
     crop = np.zeros((side, side), np.uint8)
@@ -99,7 +103,7 @@ def surface_around(
     # Outside the crop counts as no surface.
     eroded = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=[0.0])
     surface = eroded.astype(np.float32)
-    window = (LOCAL_MEAN, LOCAL_MEAN)
+    window = (_odd(LOCAL_MEAN * stretch[0]), _odd(LOCAL_MEAN * stretch[1]))
     total = cv2.boxFilter(smooth * surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     count = cv2.boxFilter(surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     mean = total / np.maximum(count, 1.0)
@@ -111,11 +115,16 @@ def surface_around(
     power = cv2.boxFilter(detail * detail, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
     strength = np.sqrt(np.maximum(power, 0.0) / np.maximum(count, 1.0))
     # Beside an edge the window is one-sided: the shading towards a contour would pass for texture, and slide.
-    sided = np.clip((count / LOCAL_MEAN**2 - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
+    sided = np.clip((count / (window[0] * window[1]) - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
     sparkle = np.clip((smooth / np.maximum(mean, 1.0) - SPARKLE) / 0.15, 0.0, 1.0)
     weight = (surface * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
     faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
     return Surface(detail / (strength + faint), weight, (column, row))
+
+
+def _odd(size: float) -> int:
+    """The odd number next to a size."""
+    return 2 * max(1, round((size - 1) / 2)) + 1
 
 
 def _noise(raw: Float32, surface: npt.NDArray[Any]) -> float:
@@ -149,10 +158,19 @@ class Patch:
         chessboard = np.indices((side, side)).sum(axis=0) % 2 == 0
         self._pixels = np.stack([self.texture, dx, dy, self.weight * chessboard], axis=-1).astype(np.float32)
 
-    def information(self) -> Array:
-        """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift."""
-        gradient = self._pixels[..., 1:3].reshape(-1, 2).astype(np.float64)
-        return np.asarray(gradient.T @ (gradient * self.weight.reshape(-1, 1)))
+    def information(self, limit: float = float("inf")) -> Array:
+        """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift.
+
+        Of a block it takes no more than `limit` times what the median block says.
+        """
+        outer = self._pixels[..., 1:3, None].astype(np.float64) * self._pixels[..., None, 1:3]
+        outer *= self.weight[..., None, None]
+        starts = np.arange(BLOCKS) * outer.shape[0] // BLOCKS
+        blocks = np.add.reduceat(np.add.reduceat(outer, starts, axis=0), starts, axis=1).reshape(-1, 2, 2)
+        amounts = np.trace(blocks, axis1=1, axis2=2)
+        if np.isfinite(limit):
+            blocks *= np.minimum(1.0, limit * np.median(amounts) / np.maximum(amounts, 1e-9))[:, None, None]
+        return np.asarray(blocks.sum(axis=0))
 
     def find(self, surface: Surface, start: Warp, prior: Array) -> Registration:
         """The patch in another image, from a predicted warp with the covariance (6, 6) of its parameters.

@@ -37,12 +37,16 @@ WIDE = 6.0  # [px] standard deviation of the place that the pose tells, from whi
 FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
-HANDOVER_ERROR = 0.50  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.15  # [px] below which no registration is believed
-PARALLAX_ERROR = 0.006  # [-] of the parallax since the patch was taken: light that moves, relief that hides
+HANDOVER_ERROR = 0.15  # [px] error that a patch adds when it is taken from a later image
+REGISTRATION_FLOOR = 0.07  # [px] below which no registration is believed
+# Errors that grow with the parallax since the first image: light that moves, relief that is no plane. They
+# stretch or shrink the parallax more than they turn it.
+PARALLAX_ERROR = 0.0045  # [-] of the parallax, along it
+PARALLAX_TURN = 0.0015  # [-] the same across it
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
+MOST_STRETCH = 1.8  # [-] of the window of the local mean and contrast with the patch
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,8 @@ class Sighting:
 class _Anchor:
     """A patch and the image it came from: pixel (2,), view, shape (2, 2) against the first patch.
 
-    `covariance` (2, 2) [px^2] is that of the point in that image; `rest` counts images until it is tried
-    again.
+    `covariance` (2, 2) [px^2] is that of the point in that image, but for what grows with the `parallax` (2,)
+    [px] since the first; `rest` counts images until it is tried again.
     """
 
     patch: Patch
@@ -68,6 +72,7 @@ class _Anchor:
     view: View | None
     shape: Array
     covariance: Array
+    parallax: Array
     rest: int = 0
 
 
@@ -80,7 +85,7 @@ class PointTrack:
         """Start at a pixel (2,) of an image (h, w); grey levels below `dark_below` are the gap."""
         surface = surface_around(grey, pixel, CROP_HALF, dark_below)
         patch = Patch(surface, pixel, PATCH_HALF)
-        self._anchors = [_Anchor(patch, pixel, view, np.eye(2), np.zeros((2, 2)))]
+        self._anchors = [_Anchor(patch, pixel, view, np.eye(2), np.zeros((2, 2)), np.zeros(2))]
         self._plane = LocalPlane(camera.bearings(pixel), view) if view is not None else None
         self._warp = Warp(pixel, np.eye(2))
         self._velocity = np.zeros(2)
@@ -107,10 +112,10 @@ class PointTrack:
         """The point in the next image (h, w), and the view it was taken from where that is known."""
         predictions = {index: self._predict(index, camera, view) for index in self._candidates()}
         centre = next(iter(predictions.values())).warp.position
-        surface = surface_around(grey, centre, CROP_HALF, self._darkness * _level(grey, centre))
         best: tuple[int, Registration] | None = None
         for index, prediction in predictions.items():
             anchor = self._anchors[index]
+            surface = self._surface(grey, centre, prediction.warp.shape)
             start = self._coarse(anchor.patch, surface, prediction)
             found = anchor.patch.find(surface, start, prediction.covariance)
             believed = _believable(found, prediction, self._fair(view, prediction))
@@ -120,7 +125,17 @@ class PointTrack:
                 break
         if best is None:
             return self._coast(predictions[len(self._anchors) - 1])
-        return self._accept(best[0], best[1], predictions[best[0]], surface, view)
+        return self._accept(best[0], best[1], predictions[best[0]], grey, view)
+
+    def _surface(self, grey: Image, centre: Array, shape: Array) -> Surface:
+        """Texture around a pixel, taken through a window of the patch's shape (2, 2) there.
+
+        Shading leaves a band in the texture beside an edge, as wide as the window. Through a window that did
+        not grow with the picture it would lag behind it, and the patch with it.
+        """
+        stretch = np.clip(np.linalg.norm(shape, axis=1), 1.0 / MOST_STRETCH, MOST_STRETCH)
+        dark_below = self._darkness * _level(grey, centre)
+        return surface_around(grey, centre, CROP_HALF, dark_below, stretch=(stretch[0], stretch[1]))
 
     def _candidates(self) -> list[int]:
         """Patches to try: the earliest that should look alike, then the newest."""
@@ -149,9 +164,10 @@ class PointTrack:
         warp = Warp(self._warp.position + self._velocity, self._warp.shape @ np.linalg.inv(anchor.shape))
         covariance = np.diag([(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4)
         # What the last image did not tell about the point, this one has to.
-        excess = float(np.linalg.eigvalsh(self._covariance - anchor.covariance)[-1])
+        known = anchor.covariance + _drift(anchor.parallax)
+        excess = float(np.linalg.eigvalsh(self._covariance - known)[-1])
         covariance[:2, :2] += max(excess, 0.0) * np.eye(2)
-        return Prediction(warp, covariance, np.zeros((6, 3)))
+        return Prediction(warp, covariance, np.zeros((6, 3)), warp.position - anchor.pixel)
 
     def _coarse(self, patch: Patch, surface: Surface, prediction: Prediction) -> Warp:
         """Best whole-pixel position around the prediction, the patch drawn as it should look there."""
@@ -173,27 +189,23 @@ class PointTrack:
         row, column = np.unravel_index(int((score - 0.3 * away**2).argmax()), score.shape)
         return Warp(warp.position + np.array([column - reach, row - reach], float), warp.shape)
 
-    def _parallax(self, prediction: Prediction, anchor: _Anchor) -> float:
-        """How far [px] the point has moved in the image because the lens moved; all of it without a pose."""
-        if self._plane is not None and prediction.jacobian.any():
-            return float(np.linalg.norm(prediction.jacobian[:2] @ self._plane.mean))
-        return float(np.linalg.norm(prediction.warp.position - anchor.pixel))
-
     def _coast(self, prediction: Prediction) -> Sighting:
         """The prediction alone, while the point is not seen."""
         self._unseen += 1
         self._velocity = 0.8 * self._velocity
         newest = self._anchors[-1]
         self._warp = Warp(prediction.warp.position, prediction.warp.shape @ newest.shape)
-        self._covariance = newest.covariance + prediction.covariance[:2, :2]
+        drift = _drift(newest.parallax + prediction.parallax)
+        self._covariance = newest.covariance + drift + prediction.covariance[:2, :2]
         return Sighting(prediction.warp.position, self._covariance, False, 0.0)
 
     def _accept(
-        self, index: int, found: Registration, prediction: Prediction, surface: Surface, view: View | None
+        self, index: int, found: Registration, prediction: Prediction, grey: Image, view: View | None
     ) -> Sighting:
         anchor = self._anchors[index]
-        floor = REGISTRATION_FLOOR**2 + (PARALLAX_ERROR * self._parallax(prediction, anchor)) ** 2
-        covariance = anchor.covariance + found.covariance[:2, :2] + floor * np.eye(2)
+        parallax = anchor.parallax + prediction.parallax
+        own = anchor.covariance + found.covariance[:2, :2] + REGISTRATION_FLOOR**2 * np.eye(2)
+        covariance = own + _drift(parallax)
         moved = found.warp.position - self._warp.position
         self._velocity = np.zeros(2) if self._unseen else 0.5 * self._velocity + 0.5 * moved
         self._unseen = 0
@@ -206,9 +218,10 @@ class PointTrack:
         strained = _strain(found.warp.shape) > MILD or found.correlation < FRESH
         clear = found.correlation > GOOD and found.seen > CLEAR
         if newest and strained and clear and index < MAXIMUM_PATCHES:
-            grown = covariance + HANDOVER_ERROR**2 * np.eye(2)
+            grown = own + HANDOVER_ERROR**2 * np.eye(2)
+            surface = self._surface(grey, found.warp.position, np.eye(2))
             patch = Patch(surface, found.warp.position, PATCH_HALF)
-            self._anchors.append(_Anchor(patch, found.warp.position, view, self._warp.shape, grown))
+            self._anchors.append(_Anchor(patch, found.warp.position, view, self._warp.shape, grown, parallax))
         return Sighting(found.warp.position, covariance, True, found.correlation)
 
 
@@ -217,6 +230,13 @@ def _level(grey: Image, position: Array) -> float:
     row, column = round(float(position[1])), round(float(position[0]))
     patch = grey[max(0, row - 24) : row + 25 : 4, max(0, column - 24) : column + 25 : 4]
     return float(np.percentile(patch, 75)) if patch.size else 0.0
+
+
+def _drift(parallax: Array) -> Array:
+    """Covariance (2, 2) [px^2] of the errors that grow with a parallax (2,) [px]."""
+    along = PARALLAX_ERROR**2 - PARALLAX_TURN**2
+    across = PARALLAX_TURN**2 * float(parallax @ parallax)
+    return np.asarray(along * np.outer(parallax, parallax) + across * np.eye(2))
 
 
 def _spread(prediction: Prediction) -> float:

@@ -19,6 +19,9 @@ ALONG = (-48, -36, -24, -12, 0, 12, 24, 36, 48)  # [px] along the edge from the 
 INSETS = (0.75, 1.0, 1.25)  # of the inset that is asked for
 PATCH_HALF = 24  # [px] half side of the piece of tissue that is judged
 MINIMUM_TISSUE = 0.4  # share of that piece that must be tissue without highlight
+MOST_OF_A_BLOCK = (
+    1.5  # of the median block's texture that one block counts: drifting debris is texture as well
+)
 DARK_SHARE = 0.35  # of the way from gap to tissue, below which a pixel is the gap
 
 
@@ -98,5 +101,7 @@ def _judge(
     texture = 0.0
     if patch.coverage >= MINIMUM_TISSUE:
         # Away from the section the distance of the points is no longer that of the edges.
-        texture = float(np.linalg.eigvalsh(patch.information())[0]) * (1.0 - (shift / 120.0) ** 2)
+        texture = float(np.linalg.eigvalsh(patch.information(MOST_OF_A_BLOCK))[0]) * (
+            1.0 - (shift / 120.0) ** 2
+        )
     return SurfacePoint(pixel, dark_below, texture, edge_kind(grey, edge, outward), outward)

@@ -47,6 +47,14 @@ class EstimatorParameters:
             "range": (0.0, 1.0),
         },
     )
+    depth_drift: float = field(
+        default=0.005,
+        metadata={
+            "description": "standard deviation of the share of its parallax by which the image carries a "
+            "point too far or not far enough, the same over a track [-]",
+            "range": (0.0, 0.1),
+        },
+    )
     max_pose_age: float = field(
         default=0.025,
         metadata={

@@ -6,12 +6,13 @@ it is no part of the covariance of a lens pose: it is considered, as the common 
 The gap's fit is taken as it is, and to its covariance comes what the shared error does to it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.multi_view import MultiViewFit, points_jacobian
+from knee_gap_uncertainty.depth_drift import widened
+from knee_gap_uncertainty.multi_view import MultiViewFit
 from knee_gap_uncertainty.posed_view import PosedView
 from knee_gap_uncertainty.views import Views
 
@@ -64,19 +65,7 @@ class CalibrationError:
             return fit
         shift = self._moved_points(fit, views)
         moved = shift @ self._root()
-        added = moved @ moved.T
-        inverse = np.linalg.inv(points_jacobian(fit.frames, fit.unknowns))
-        before = fit.gap_deviation**2
-        covariance = fit.covariance + added
-        wider = replace(
-            fit,
-            covariance=covariance,
-            unknowns_covariance=fit.unknowns_covariance + inverse @ added @ inverse.T,
-        )
-        after = wider.gap_deviation**2
-        shares = fit.shares * (before / after)
-        shares[3] += 1.0 - before / after
-        return replace(wider, shares=shares)
+        return widened(fit, moved @ moved.T)
 
     def bounds(self, first: PosedView, present: PosedView, factor: float) -> tuple[float, float]:
         """What the shared error adds to the bounds of an angle [rad] and of a lens position [m], two views.

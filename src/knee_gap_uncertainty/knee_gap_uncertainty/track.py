@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
+from knee_gap_uncertainty.depth_drift import with_depth_drift
 from knee_gap_uncertainty.errors import (
     MeasurementError,
     ParallelToTravelError,
@@ -111,6 +112,7 @@ class Track:
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
             return self._told(blank, view, flaw)
+        fitted = with_depth_drift(fitted, self._first.lens, self._parameters.depth_drift)
         if self._calibration is not None:
             fitted = self._calibration.widened(fitted, views)
         try:

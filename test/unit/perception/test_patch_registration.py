@@ -82,3 +82,41 @@ def test_errors_are_not_larger_than_the_covariance_says(noise):
         covariance = found.covariance[:2, :2] + REGISTRATION_FLOOR**2 * np.eye(2)
         squares.append(float(error @ np.linalg.solve(covariance, error)) / 2)
     assert np.mean(squares) < 1.3
+
+
+def _edge_of_bone(zoom: float, rng: np.random.Generator) -> np.ndarray:
+    """Bone that darkens towards the gap below it, 14 px under its point, seen `zoom` times as large."""
+    detail = cv2.GaussianBlur(np.random.default_rng(7).standard_normal((256, 256)), (0, 0), 3.0)
+    depth = np.arange(256)[:, None] - 142.0
+    shade = np.sqrt(np.clip(-depth / 40.0, 0.0, 1.0))
+    bone = 160.0 * shade * (1.0 + 0.03 * detail / detail.std())
+    whole = np.where(depth < 0, np.maximum(bone, 12.0), 12.0)
+    matrix = np.array([[zoom, 0.0, 128.0 * (1 - zoom)], [0.0, zoom, 128.0 * (1 - zoom)]])
+    seen = cv2.warpAffine(whole, matrix, (256, 256), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.clip(np.rint(seen + rng.standard_normal(seen.shape)), 0, 255).astype(np.uint8)
+
+
+def test_shading_beside_an_edge_holds_a_patch_back_less_through_a_window_that_grows_with_the_picture():
+    zoom, errors = 1.2, np.zeros((4, 2))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        patch, larger = _patch(_edge_of_bone(1.0, rng)), _edge_of_bone(zoom, rng)
+        for k, stretch in enumerate((zoom, 1.0)):
+            surface = surface_around(larger, CENTRE, 64, 30, stretch=(stretch, stretch))
+            found = patch.find(surface, Warp(CENTRE, zoom * np.eye(2)), WIDE_PRIOR)
+            errors[seed, k] = np.linalg.norm(found.warp.position - CENTRE)
+    assert errors[:, 0].max() < 0.4
+    assert errors[:, 0].mean() < 0.5 * errors[:, 1].mean()
+
+
+def test_one_spot_of_debris_is_not_taken_for_texture_to_follow():
+    rng = np.random.default_rng(1)
+    textured = _patch(_seen(_speckle(rng, 12.0), np.zeros(2), 1.0, rng))
+    rows, columns = np.mgrid[:256, :256] - 118.0
+    spot = _speckle(rng, 1.0) + 60.0 * np.exp(-(rows**2 + columns**2) / (2 * 2.5**2))
+    spotted = _patch(_seen(spot, np.zeros(2), 1.0, rng))
+    share = [
+        np.linalg.eigvalsh(patch.information(1.5))[0] / np.linalg.eigvalsh(patch.information())[0]
+        for patch in (textured, spotted)
+    ]
+    assert share[1] < 0.9 * share[0]

@@ -1,0 +1,64 @@
+"""Rendered images of the bench, kept on disk: rendering takes far longer than what is measured on it."""
+
+from collections.abc import Iterator
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+
+from knee_gap_simulation.bench import Bench, BenchFrame
+from knee_gap_simulation.imaging import decoded
+
+
+def frames_of(bench: Bench, folder: Path | None) -> Iterator[BenchFrame]:
+    """The images of a bench: from the folder where they are all kept there, else rendered and kept."""
+    if folder is None:
+        yield from bench.frames()
+        return
+    settings = bench.settings
+    level = "".join(map(str, astuple(settings.hardness)))
+    name = f"{level}_{settings.seed}_{settings.travel_direction}_{settings.duration_s:g}_{settings.fps:g}"
+    kept = folder / name
+    files = [kept / f"{index:05d}.npz" for index in range(bench.frame_count)]
+    if all(file.exists() for file in files):
+        yield from map(_load, files)
+        return
+    kept.mkdir(parents=True, exist_ok=True)
+    for file, frame in zip(files, bench.frames(), strict=True):
+        _save(file, frame)
+        yield frame
+
+
+def _save(file: Path, frame: BenchFrame) -> None:
+    unfinished = file.with_suffix(".part")
+    with unfinished.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            index=frame.index,
+            stamp_ns=frame.stamp_ns,
+            jpeg=np.frombuffer(frame.jpeg, np.uint8),
+            T_world_lens=frame.T_world_lens,
+            T_world_lens_tracked=frame.T_world_lens_tracked,
+            gap_mask=np.packbits(frame.gap_mask),
+            shape=frame.gap_mask.shape,
+            debris_cover=frame.debris_cover,
+            probe=frame.probe,
+        )
+    # A run that is broken off leaves no file that looks whole.
+    unfinished.rename(file)
+
+
+def _load(file: Path) -> BenchFrame:
+    with np.load(file) as kept:
+        jpeg, shape = kept["jpeg"].tobytes(), tuple(int(side) for side in kept["shape"])
+        return BenchFrame(
+            index=int(kept["index"]),
+            stamp_ns=int(kept["stamp_ns"]),
+            jpeg=jpeg,
+            image=decoded(jpeg),
+            T_world_lens=kept["T_world_lens"],
+            T_world_lens_tracked=kept["T_world_lens_tracked"],
+            gap_mask=np.unpackbits(kept["gap_mask"])[: shape[0] * shape[1]].reshape(shape).astype(bool),
+            debris_cover=kept["debris_cover"],
+            probe=kept["probe"],
+        )
