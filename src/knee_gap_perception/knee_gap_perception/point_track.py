@@ -37,12 +37,12 @@ WIDE = 6.0  # [px] standard deviation of the place that the pose tells, from whi
 FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
-HANDOVER_ERROR = 0.15  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.07  # [px] below which no registration is believed
+HANDOVER_ERROR = 0.10  # [px] error that a patch adds when it is taken from a later image
+REGISTRATION_FLOOR = 0.06  # [px] below which no registration is believed
 # Errors that grow with the parallax since the first image: light that moves, relief that is no plane. They
 # stretch or shrink the parallax more than they turn it.
-PARALLAX_ERROR = 0.0045  # [-] of the parallax, along it
-PARALLAX_TURN = 0.0015  # [-] the same across it
+PARALLAX_ERROR = 0.004  # [-] of the parallax, along it
+PARALLAX_TURN = 0.0013  # [-] the same across it
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
