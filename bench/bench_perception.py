@@ -1,4 +1,7 @@
-"""What an image costs segmentation_node's core, beside the floor: decoding the JPEG it came in."""
+"""What an image costs segmentation_node's core, beside the floor: decoding the JPEG it came in.
+
+Points are followed with the tracked pose of the lens, as when the tracker runs, and by the images alone.
+"""
 
 import argparse
 import sys
@@ -10,6 +13,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+from bench_edges import lens_pose
 
 from knee_gap_perception.camera import FisheyeCamera
 from knee_gap_perception.edge_detector import GapEdgeDetector
@@ -39,20 +43,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
-    detector = GapEdgeDetector()
-    detector.process(0, frames[0].image, camera)
-    detector.process(1, frames[1].image, camera)
-    detector.end_track()
-    decoding, following, valid = [], [], 0
     order = [frame for turn in range(asked.rounds) for frame in (frames if turn % 2 == 0 else frames[-2::-1])]
-    for index, frame in enumerate(order):
-        message = SimpleNamespace(format="jpeg", data=frame.jpeg)
-        spent, image = timed(partial(image_from_compressed, message))
-        decoding.append(spent)
-        stamp = 16_666_667 * (index + 1)
-        spent, edges = timed(partial(detector.process, stamp, image, camera))
-        following.append(spent)
-        valid += edges.status is EdgeStatus.VALID
+    decoding: list[float] = []
+    following: dict[str, list[float]] = {}
+    for guide in ("with poses", "images alone"):
+        detector, following[guide], valid = GapEdgeDetector(), [], 0
+        for frame in frames[:2]:
+            detector.process(frame.index, frame.image, camera)
+        detector.end_track()
+        for index, frame in enumerate(order):
+            message = SimpleNamespace(format="jpeg", data=frame.jpeg)
+            spent, image = timed(partial(image_from_compressed, message))
+            decoding.append(spent)
+            pose = lens_pose(frame) if guide == "with poses" else None
+            stamp = 16_666_667 * (index + 1)
+            spent, edges = timed(partial(detector.process, stamp, image, camera, pose))
+            following[guide].append(spent)
+            valid += edges.status is EdgeStatus.VALID
+        print(f"{guide}: {valid} of {len(order)} images valid")
     # As long as no gap is found every image is searched.
     searcher = GapEdgeDetector(EdgeParameters(minimum_confidence=1.0))
     searching = [
@@ -61,18 +69,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     ]
     masking, mask = timed(detector.gap_mask)
     drawing, _ = timed(partial(draw_overlay, order[-1].image, edges, mask, "", camera))
-    print(
-        f"{len(order)} images of {lens.width_px}x{lens.height_px}, level {asked.level}, "
-        f"{valid} valid, one core"
-    )
-    print(f"decoding alone   p50 {percentile(decoding, 50):5.1f} ms  p99 {percentile(decoding, 99):5.1f} ms")
-    print(
-        f"edges            p50 {percentile(following, 50):5.1f} ms  p99 {percentile(following, 99):5.1f} ms"
-    )
-    print(
-        f"search, no gap   p50 {percentile(searching, 50):5.1f} ms  p99 {percentile(searching, 99):5.1f} ms"
-    )
-    ratio = percentile(following, 50) / percentile(decoding, 50)
+    print(f"{len(order)} images of {lens.width_px}x{lens.height_px}, level {asked.level}, one core")
+    print(f"decoding alone       {told(decoding)}")
+    for guide, seconds in following.items():
+        print(f"edges, {guide:13s} {told(seconds)}")
+    print(f"search, no gap       {told(searching)}")
+    ratio = percentile(following["with poses"], 50) / percentile(decoding, 50)
     print(f"edges / decoding     {ratio:5.2f}")
     print(f"mask, when asked for {1e3 * masking:5.1f} ms; overlay, when asked for {1e3 * drawing:.1f} ms")
     return 0
@@ -83,6 +85,11 @@ def timed(work: Callable[[], Result]) -> tuple[float, Result]:
     start = process_time()
     result = work()
     return process_time() - start, result
+
+
+def told(seconds: list[float]) -> str:
+    """Median and 99th percentile in milliseconds."""
+    return f"p50 {percentile(seconds, 50):5.1f} ms  p99 {percentile(seconds, 99):5.1f} ms"
 
 
 def percentile(seconds: list[float], share: float) -> float:
