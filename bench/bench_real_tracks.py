@@ -44,7 +44,7 @@ FRAME_NS = 33_333_333
 
 
 class Reconstruction(NamedTuple):
-    """`poses` T_world_lens (n, 4, 4) [m] of n images, `points` (m, 3) [m], `seen` (n, m): which shows which."""
+    """`poses` T_world_lens (n, 4, 4) [m], `points` (m, 3) [m], `seen` (n, m): which image shows which."""
 
     images: list[Image]
     camera: Camera

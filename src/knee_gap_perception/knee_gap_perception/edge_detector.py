@@ -245,7 +245,7 @@ class GapEdgeDetector:
         points = choose_points(grey, section, field, self.parameters.inset / coarseness)
         if points is None:
             raise _NoPointsError(
-                EdgeStatus.LOW_CONTRAST, "the tissue beside the gap has no texture to follow"
+                EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
             )
         first, second = (PointTrack(grey, point.pixel, point.dark_below, camera, view) for point in points)
         self._tracks += 1

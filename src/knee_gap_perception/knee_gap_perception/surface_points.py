@@ -54,13 +54,16 @@ def choose_points(
     for index, sign in enumerate((-1.0, 1.0)):
         outward = sign * section.across
         along = np.array([-outward[1], outward[0]])
-        tissue = _level(grey, section.edges[index] + (EDGE_SEARCH + inset_px) * outward)
+        # Shaded bone behind a rim may pass for tissue: the edge is looked for up to where tissue was measured.
+        reach = EDGE_SEARCH + inset_px
+        tissue = _level(grey, section.edges[index] + reach * outward)
         if tissue <= gap:
             return None
         dark_below = gap + DARK_SHARE * (tissue - gap)
         candidates = []
         for shift in ALONG:
-            edge = _edge_on_line(grey, section.edges[index] + shift * along, outward, (gap + tissue) / 2)
+            start = section.edges[index] + shift * along
+            edge = _edge_on_line(grey, start, outward, reach, (gap + tissue) / 2)
             if edge is not None:
                 places = [edge + share * inset_px * outward for share in INSETS]
                 candidates += [_judge(grey, place, dark_below, shift, edge, outward) for place in places]
@@ -79,9 +82,12 @@ def _level(grey: Image, pixel: Array) -> float:
     return float(np.median(patch)) if patch.size else 0.0
 
 
-def _edge_on_line(grey: Image, start: Array, outward: Array, threshold: float) -> Array | None:
-    """Where brightness rises over the threshold along a line to the tissue (2,), to half a pixel."""
-    steps = np.arange(-EDGE_SEARCH, EDGE_SEARCH, 0.5)
+def _edge_on_line(grey: Image, start: Array, outward: Array, reach: float, threshold: float) -> Array | None:
+    """Where brightness rises over the threshold along a line to the tissue (2,), to half a pixel.
+
+    The line ends `reach` [px] beyond its start.
+    """
+    steps = np.arange(-EDGE_SEARCH, reach, 0.5)
     points = np.rint(start + steps[:, None] * outward).astype(int)
     inside = (points >= 0).all(axis=1) & (points < [grey.shape[1], grey.shape[0]]).all(axis=1)
     if not inside.all():
