@@ -54,7 +54,7 @@ def choose_points(
     for index, sign in enumerate((-1.0, 1.0)):
         outward = sign * section.across
         along = np.array([-outward[1], outward[0]])
-        # Shaded bone behind a rim may pass for tissue: the edge is looked for up to where tissue was measured.
+        # Shaded bone behind a rim may pass for tissue: the edge may lie as far as tissue was measured.
         reach = EDGE_SEARCH + inset_px
         tissue = _level(grey, section.edges[index] + reach * outward)
         if tissue <= gap:

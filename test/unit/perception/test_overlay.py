@@ -30,10 +30,10 @@ def test_a_larger_error_is_drawn_larger(joint: Any, travel: Any) -> None:
     empty = np.zeros((0, 0), np.uint8)
     small = draw_overlay(image, edges, empty, "", joint.camera) != image
     large = (
-        draw_overlay(image, replace(edges, covariances=25 * edges.covariances), empty, "", joint.camera)
+        draw_overlay(image, replace(edges, covariances=400 * edges.covariances), empty, "", joint.camera)
         != image
     )
-    # Two ellipses, five times as wide.
+    # Two ellipses, twenty times as wide.
     assert large.sum() > small.sum() + 500
 
 
