@@ -161,7 +161,8 @@ def against_reconstruction(scene: Reconstruction, count: int, out: Path) -> None
 
 def gap_points(scene: Reconstruction) -> None:
     """The two points that are chosen beside the cleft, against the poses."""
-    detector, lines, starts, begun = GapEdgeDetector(), [], np.zeros((2, 2)), {}
+    detector, lines, bounds, starts = GapEdgeDetector(), [], [], np.zeros((2, 2))
+    begun: dict[int, int] = {}
     covariance = np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3)
     for index, image in enumerate(scene.images):
         T = scene.poses[index]
@@ -175,7 +176,13 @@ def gap_points(scene: Reconstruction) -> None:
             continue
         first = begun[edges.track_id]
         lines += [off_the_line(scene, first, starts[n], index, edges.pixels[n]) for n in range(2)]
-    print(f"beside the cleft: {len(begun)} tracks; epipolar {told(lines)}" if lines else "no cleft found")
+        bounds += [edges.angular_error / scene.camera.radians_per_pixel(edges.pixels[n]) for n in range(2)]
+    if lines:
+        inside = 100 * np.mean(np.array(lines) <= np.array(bounds))
+        print(
+            f"beside the cleft: {len(begun)} tracks; epipolar {told(lines)}\n"
+            f"  within angular_error, median {np.median(bounds):.1f} px, in {inside:.0f} %"
+        )
 
 
 def quaternion_of(rotation: Array) -> Array:
