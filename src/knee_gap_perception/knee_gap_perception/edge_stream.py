@@ -6,6 +6,7 @@ and not foretold. It waits for nothing else, and not where no pose is to be expe
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from math import nan
 from typing import Any, NamedTuple
 
 from knee_gap_perception.calibration.calibration_file import Calibration
@@ -23,28 +24,37 @@ from knee_gap_perception.messages import (
     lens_pose_from_message,
     stamp_ns,
 )
+from knee_gap_perception.notch_follower import NotchFollower, NotchSight
 from knee_gap_perception.overlay import draw_overlay
 from knee_gap_perception.segmentation_parameters import PoseParameters
 
 NO_CAMERA = "no camera_info received yet"
 # At 60 Hz and the longest wait no more images wait than these; of a faster camera the oldest waits no longer.
 MOST_WAITING = 8
+# With one lens pose an image, the longest time between two: of 10 images a second.
+LONGEST_FRAME_NS = 100_000_000
 
 
 class _Waiting(NamedTuple):
-    """An image that waits for a lens pose, and when it arrived [ns]."""
+    """An image that waits for a lens pose, and when it arrived [ns].
+
+    `image` where it was looked at already; `expects_pose` is False where none can come.
+    """
 
     message: Any
     stamp_ns: int
     arrival_ns: int
+    image: Image | None = None
+    expects_pose: bool = True
 
 
 class EdgeStream:
     """Takes messages by field name; whatever is wrong with one is a status, a reason and a count.
 
     Images are handed in by `on_image` and come out, in order, as edges from `ready`. With a `calibration` the
-    camera is its own, whatever camera_info says, and images of another size are refused. Raises
-    PerceptionError for a calibration without a camera.
+    camera is its own, whatever camera_info says, and images of another size are refused. `by_notch`: the
+    notch is looked for in every image as it arrives, and there is one lens pose an image, which rests on it.
+    Raises PerceptionError for a calibration without a camera, or without the notch that is to be found.
     """
 
     def __init__(
@@ -52,6 +62,8 @@ class EdgeStream:
         parameters: EdgeParameters | None = None,
         poses: PoseParameters | None = None,
         calibration: Calibration | None = None,
+        *,
+        by_notch: bool = False,
     ) -> None:
         self.detector = GapEdgeDetector(parameters)
         self.counts: Counter[str] = Counter()
@@ -68,8 +80,18 @@ class EdgeStream:
         if calibration is not None:
             self._camera, self._camera_flaw = calibration.require_camera().camera(), ""
         self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
-        self._poses = LensPosePredictor()
+        self._notch: NotchFollower | None = None
+        if by_notch:
+            if calibration is None:
+                raise PerceptionError("scope_turn_notch needs a calibration_file of calibrate oblique")
+            self._notch = NotchFollower(calibration.require_notch())
+        self._poses = LensPosePredictor(LONGEST_FRAME_NS) if by_notch else LensPosePredictor()
         self._waiting: deque[_Waiting] = deque()
+
+    @property
+    def by_notch(self) -> bool:
+        """Whether the notch is looked for."""
+        return self._notch is not None
 
     @property
     def waiting(self) -> int:
@@ -109,9 +131,25 @@ class EdgeStream:
         except PerceptionError:
             self.counts["lens poses refused"] += 1
 
-    def on_image(self, message: Any, now_ns: int = 0) -> None:
-        """Take a sensor_msgs/Image or sensor_msgs/CompressedImage that arrives at a time [ns]."""
-        self._waiting.append(_Waiting(message, stamp_ns(message.header), now_ns))
+    def on_image(self, message: Any, now_ns: int = 0) -> NotchSight | None:
+        """Take a sensor_msgs/Image or sensor_msgs/CompressedImage that arrives at a time [ns].
+
+        Returns where its notch is, for whoever needs it for the pose of the lens; None where nobody does.
+        """
+        stamp = stamp_ns(message.header)
+        if self._notch is None:
+            self._waiting.append(_Waiting(message, stamp, now_ns))
+            return None
+        image = None
+        try:
+            image = _read(message)
+            self._refuse_other_size(image)
+            sight = self._notch.look(stamp, image)
+        except PerceptionError as error:
+            sight = NotchSight(stamp, nan, nan, str(error))
+        self.counts["the notch is seen" if sight.seen else f"no turn of the scope: {sight.reason}"] += 1
+        self._waiting.append(_Waiting(message, stamp, now_ns, image, sight.seen))
+        return sight
 
     def ready(self, now_ns: int = 0) -> Iterator[GapEdges]:
         """Edges of the images that need not wait at a time [ns]; each is looked at when it is asked for.
@@ -123,22 +161,21 @@ class EdgeStream:
             waited_ns = now_ns - waiting.arrival_ns
             # A clock that ran backwards tells nothing of the wait.
             in_time = 0 <= waited_ns < self._wait_ns and len(self._waiting) <= MOST_WAITING
-            if in_time and self._poses.expects_after(waiting.stamp_ns):
+            if in_time and waiting.expects_pose and self._poses.expects_after(waiting.stamp_ns):
                 return
             self._waiting.popleft()
-            yield self._look(waiting.message)
+            yield self._look(waiting)
 
     def finish(self) -> Iterator[GapEdges]:
         """Edges of the images for which no pose will come any more."""
         while self._waiting:
-            yield self._look(self._waiting.popleft().message)
+            yield self._look(self._waiting.popleft())
 
-    def _look(self, message: Any) -> GapEdges:
-        stamp, frame_id = stamp_ns(message.header), str(message.header.frame_id)
+    def _look(self, waiting: _Waiting) -> GapEdges:
+        stamp, frame_id = waiting.stamp_ns, str(waiting.message.header.frame_id)
         self._image = None
         try:
-            is_compressed = hasattr(message, "format")
-            image = image_from_compressed(message) if is_compressed else image_from_message(message)
+            image = _read(waiting.message) if waiting.image is None else waiting.image
             self._image = image
             self._refuse_other_size(image)
             if self._camera is None:
@@ -185,3 +222,7 @@ class EdgeStream:
         if self._image is None or self.latest is None or mask is None:
             return None
         return draw_overlay(self._image, self.latest, mask, self.reason, self._camera)
+
+
+def _read(message: Any) -> Image:
+    return image_from_compressed(message) if hasattr(message, "format") else image_from_message(message)

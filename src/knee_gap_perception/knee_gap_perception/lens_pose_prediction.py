@@ -16,8 +16,7 @@ Array = npt.NDArray[np.float64]
 
 POSES = 3  # through which the motion is drawn
 KEPT = 512  # poses: half a second of the fastest tracker, longer than an image is on its way
-LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion
-LONGEST_AHEAD_NS = 40_000_000  # beyond the last pose
+LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion, and beyond the last
 ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
 ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
 
@@ -25,7 +24,9 @@ ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
 class LensPosePredictor:
     """Takes lens poses in the order of their stamps and tells the pose at a stamp near the last of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, longest_step_ns: int = LONGEST_STEP_NS) -> None:
+        """`longest_step_ns`: the longest time between poses, and from the last to the stamp asked for."""
+        self._longest_step_ns = longest_step_ns
         self._poses: deque[LensPose] = deque(maxlen=KEPT)
 
     def add(self, pose: LensPose) -> None:
@@ -40,12 +41,16 @@ class LensPosePredictor:
         """Whether a pose after a stamp [ns] is still to come, from a tracker that has not fallen silent."""
         if not self._poses:
             return False
-        return 0 < stamp_ns - self._poses[-1].stamp_ns <= LONGEST_AHEAD_NS
+        return 0 < stamp_ns - self._poses[-1].stamp_ns <= self._longest_step_ns
 
     def at(self, stamp_ns: int) -> LensPose | None:
         """The pose at a stamp [ns] with its covariance; None where no poses are close enough."""
         near = self._motion(stamp_ns)
-        if len(near) < 2 or stamp_ns - near[-1].stamp_ns > LONGEST_AHEAD_NS or stamp_ns < near[0].stamp_ns:
+        if (
+            len(near) < 2
+            or stamp_ns - near[-1].stamp_ns > self._longest_step_ns
+            or stamp_ns < near[0].stamp_ns
+        ):
             return None
         times = np.array([pose.stamp_ns - stamp_ns for pose in near]) / 1e9
         # Value at time 0 of the line through the poses, as weights of the poses.
@@ -79,7 +84,7 @@ class LensPosePredictor:
         wanted = 2 if self._poses[end - 1].stamp_ns >= stamp_ns else POSES
         motion = [self._poses[end - 1]]
         for index in range(end - 2, max(end - 1 - wanted, -1), -1):
-            if motion[0].stamp_ns - self._poses[index].stamp_ns > LONGEST_STEP_NS:
+            if motion[0].stamp_ns - self._poses[index].stamp_ns > self._longest_step_ns:
                 break
             motion.insert(0, self._poses[index])
         return motion

@@ -1,11 +1,15 @@
 """Pose messages to bodies and lens poses to messages, by field name, whoever's classes they are."""
 
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
 
 from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.notch_follower import NotchSight
 from knee_gap_perception.poses import BodyPose, LensPose
+
+NOT_TOLD = "the notch is not seen, and no reason was told"
 
 
 def body_pose_from_message(message: Any, name: str = "") -> BodyPose:
@@ -59,6 +63,25 @@ def fill_scope_calibration(message: Any, node: str, calibration: Calibration | N
             message.time_offset_error = calibration.clock.sigma
     message.lens_covariance = np.array(covariance, dtype=np.float64).reshape(36)
     return message
+
+
+def fill_scope_notch(message: Any, sight: NotchSight, frame_id: str) -> Any:
+    """Set every field of a knee_gap_msgs/ScopeNotch; returns the message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sight.stamp_ns, 1_000_000_000)
+    message.header.frame_id = frame_id
+    message.seen, message.reason = sight.seen, sight.reason
+    message.angle, message.angle_error = float(sight.angle), float(sight.angle_error)
+    return message
+
+
+def notch_from_message(message: Any) -> NotchSight:
+    """The sight of a knee_gap_msgs/ScopeNotch; numbers that are none are no sight, whatever it says."""
+    stamp = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+    reason = "" if message.seen else str(message.reason) or NOT_TOLD
+    angle, error = float(message.angle), float(message.angle_error)
+    if not reason and not (isfinite(angle) and isfinite(error) and error >= 0.0):
+        reason = f"the notch's angle must be finite, with its error, not {angle:g} and {error:g}"
+    return NotchSight(stamp, nan if reason else angle, nan if reason else error, reason)
 
 
 def _fill_header(header: Any, lens: LensPose) -> None:

@@ -9,7 +9,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
-from knee_gap_msgs.msg import GapEdges, ScopeCalibration
+from knee_gap_msgs.msg import GapEdges, ScopeCalibration, ScopeNotch
 from knee_gap_msgs.srv import ChoosePoint
 from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
@@ -19,7 +19,7 @@ from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.messages_tracking import fill_scope_calibration
+from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
 from knee_gap_perception.segmentation_parameters import PoseParameters, TransportParameters
 from knee_gap_perception.warm_up import warm_up
 
@@ -34,7 +34,7 @@ class SegmentationNode(BaseNode):
         edges, calibration = self.declare(EdgeParameters), self.declare(CalibrationParameters)
         self.refuse_unknown_parameters()
         try:
-            self._stream = EdgeStream(edges, poses, calibration.load())
+            self._stream = EdgeStream(edges, poses, calibration.load(), by_notch=calibration.scope_turn_notch)
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
         # Compiled before the first image, so that its answer is not late.
@@ -42,6 +42,8 @@ class SegmentationNode(BaseNode):
         self._dropped = 0
         self._sequence: int | None = None
         self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)
+        if calibration.scope_turn_notch:
+            self._notch = self.create_publisher(ScopeNotch, "scope_notch", RESULT_QOS)
         self._mask = self.create_publisher(Image, "gap_mask", IMAGE_QOS)
         self._overlay = self.create_publisher(Image, "~/overlay", IMAGE_QOS)
         kind, topic = {
@@ -66,7 +68,9 @@ class SegmentationNode(BaseNode):
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
         """Take an image; it is looked at now, or once the pose that follows it is there."""
         self.count_dropped(info.get("publication_sequence_number"))
-        self._stream.on_image(message, self.now_ns())
+        if (sight := self._stream.on_image(message, self.now_ns())) is not None:
+            # At once: the pose that the image waits for rests on it.
+            self._notch.publish(fill_scope_notch(ScopeNotch(), sight, message.header.frame_id))
         self.publish_ready()
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:

@@ -10,12 +10,15 @@ from scipy.spatial.transform import Rotation
 from knee_gap_perception.calibration.calibration_file import Calibration
 from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.notch_follower import NotchSight
 from knee_gap_perception.parameters import check_parameters
 from knee_gap_perception.pose_validity import PoseValidity, Refusal, RefusalReason, ValidityParameters
 from knee_gap_perception.poses import Array, BodyPose, LensPose, cross_matrix, rigid_transform
 from knee_gap_perception.reference_body import relative_to
+from knee_gap_perception.turned_poses import Tracked, TurnedPoses
 
 # What says where the lens sits, unless a calibration does.
+NO_NOTCH_YET = "nobody tells of the notch: is scope_turn_notch set for segmentation_node, and do images come?"
 PLACE_OF_LENS = ("body_to_shaft_translation", "body_to_shaft_quaternion_xyzw", "oblique_angle")
 
 
@@ -131,10 +134,16 @@ class ScopeTracker:
         parameters: TrackingParameters | None = None,
         validity: ValidityParameters | None = None,
         calibration: Calibration | None = None,
+        *,
+        by_notch: bool = False,
     ) -> None:
+        """`by_notch`: the notch in each image tells how far the scope is turned in its camera head.
+
+        Raises PerceptionError for settings that contradict each other, or the calibration.
+        """
         self.parameters = parameters or TrackingParameters()
         self.calibration = calibration
-        _refuse_contradictions(self.parameters, calibration)
+        _refuse_contradictions(self.parameters, calibration, by_notch=by_notch)
         self.validity = PoseValidity(validity)
         self.reference_validity = PoseValidity(validity)
         self.turn_validity = PoseValidity(validity)
@@ -145,9 +154,31 @@ class ScopeTracker:
         clock = calibration.clock if calibration else None
         self._clock_offset_ns = round(clock.offset * 1e9) if clock else 0
         self.turn = 0.0
+        self._by_notch = TurnedPoses(self._lens_by_notch) if by_notch else None
+        # Why the latest image had no pose, where its notch was to tell the turn; empty where it had one.
+        self.notch_flaw = NO_NOTCH_YET if by_notch else ""
 
-    def update(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> LensPose | Refusal:
+    @property
+    def by_notch(self) -> bool:
+        """Whether the notch in each image tells how far the scope is turned."""
+        return self._by_notch is not None
+
+    def take(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> list[LensPose | Refusal]:
+        """Take a frame of the tracker, as `update`; return all that follows from it."""
+        result = self.update(body, others)
+        return [*([] if result is None else [result]), *self._at_images()]
+
+    def take_notch(self, sight: NotchSight) -> list[LensPose | Refusal]:
+        """Take where the notch is in an image; return the poses of the lens that it made possible."""
+        if self._by_notch is None:
+            return []
+        self._by_notch.add_sight(sight)
+        return self._at_images()
+
+    def update(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> LensPose | Refusal | None:
         """Return the pose of the lens at the stamp of `body`, or why there is none.
+
+        None where the body is sound and the pose waits for the notch of an image.
 
         `others` are the other bodies of the same frame of the tracker, if it tells them: a body that has
         swapped its label with one of them is refused. The reference body, if there is to be one, must be
@@ -166,17 +197,43 @@ class ScopeTracker:
             refusal = self.validity.refuse(body, RefusalReason.NO_TURN, fault)
         if refusal is not None:
             return refusal
+        tracked = Tracked(body.stamp_ns - self._clock_offset_ns, body, reference)
+        if self._by_notch is not None:
+            self._by_notch.add_tracked(tracked)
+            return None
         self.accepted_count += 1
         if second is not None:
             self._note_turn(body, second)
-        lens = self._lens_pose(body)
-        return lens if reference is None else relative_to(lens, reference, self._body_covariance())
+        return self._lens_pose(tracked, self.turn, 0.0)
 
     def reset(self) -> None:
         """Start afresh, as after a change of the set-up; the counts go on."""
         self.validity.reset()
         self.reference_validity.reset()
         self.turn_validity.reset()
+        if self._by_notch is not None:
+            self._by_notch.clear()
+
+    def _at_images(self) -> list[LensPose | Refusal]:
+        if self._by_notch is None:
+            return []
+        told: list[LensPose | Refusal] = []
+        for lens in self._by_notch.ready():
+            if isinstance(lens, LensPose):
+                self.accepted_count += 1
+                self.notch_flaw = ""
+                told.append(lens)
+            else:
+                self.notch_flaw = lens.reason
+                refusal = Refusal(lens.stamp_ns, RefusalReason.NO_TURN, lens.reason)
+                self.validity.counts[refusal.reason] += 1
+                told.append(refusal)
+        return told
+
+    def _lens_by_notch(self, tracked: Tracked, angle: float, angle_error: float) -> LensPose:
+        assert self.calibration is not None  # by_notch is refused without one
+        self.turn = self.calibration.scope_turn(angle)
+        return self._lens_pose(tracked, self.turn, angle_error)
 
     def _reference_fault(
         self, body: BodyPose, reference: BodyPose | None, bodies: tuple[BodyPose, ...]
@@ -196,22 +253,32 @@ class ScopeTracker:
         scope = rigid_transform(second.position, second.quaternion_xyzw)
         self.turn = self.calibration.scope_turn_of_body(np.linalg.inv(head) @ scope)
 
-    def _lens_pose(self, body: BodyPose) -> LensPose:
-        parameters = self.parameters
+    def _lens_pose(self, tracked: Tracked, turn: float, turn_error: float) -> LensPose:
+        """Pose of the lens at a turn [rad] of the scope, with its standard error."""
+        parameters, body = self.parameters, tracked.body
         R_world_body = Rotation.from_quat(body.quaternion_xyzw)
         T_body_lens = self._T_body_lens
-        if self.calibration is not None and self.turn:
-            T_body_lens = self.calibration.body_to_lens(self.turn)
+        if self.calibration is not None and turn:
+            T_body_lens = self.calibration.body_to_lens(turn)
         lever = R_world_body.apply(T_body_lens[:3, 3])
         quaternion = (R_world_body * Rotation.from_matrix(T_body_lens[:3, :3])).as_quat(canonical=True)
-        return LensPose(
-            stamp_ns=body.stamp_ns - self._clock_offset_ns,
+        covariance = self._covariance(lever) + self._axis_covariance(turn)
+        if turn_error and self.calibration is not None:
+            moved = np.kron(np.eye(2), R_world_body.as_matrix()) @ self.calibration.motion_by_turn(
+                T_body_lens
+            )
+            covariance = covariance + turn_error**2 * np.outer(moved, moved)
+        lens = LensPose(
+            stamp_ns=tracked.stamp_ns,
             frame_id=parameters.frame_id,
             child_frame_id=parameters.child_frame_id,
             position=body.position + lever,
             quaternion_xyzw=quaternion,
-            covariance=self._covariance(lever) + self._axis_covariance(),
+            covariance=covariance,
         )
+        if tracked.reference is None:
+            return lens
+        return relative_to(lens, tracked.reference, self._body_covariance())
 
     def _covariance(self, lever: Array) -> Array:
         """Covariance (6, 6) of the lens pose; a small rotation r moves the lens by r x lever."""
@@ -222,12 +289,12 @@ class ScopeTracker:
         J[:3, 3:] = -cross_matrix(lever)
         return np.asarray(J @ covariance @ J.T)
 
-    def _axis_covariance(self) -> Array:
-        """What the error of the shaft's axis adds at the present turn: nothing at the calibrated one."""
+    def _axis_covariance(self, turn: float) -> Array:
+        """What the error of the shaft's axis adds at a turn: nothing at the calibrated one."""
         oblique = self.calibration.oblique if self.calibration else None
-        if oblique is None or oblique.axis is None or not self.turn:
+        if oblique is None or oblique.axis is None or not turn:
             return np.zeros((6, 6))
-        chord = 2.0 * np.sin(0.5 * self.turn)
+        chord = 2.0 * np.sin(0.5 * turn)
         return np.diag(
             np.repeat([(chord * oblique.axis_shift_sigma) ** 2, (chord * oblique.axis_tilt_sigma) ** 2], 3)
         )
@@ -249,10 +316,18 @@ def _fault(
     return None if refusal is None else f"{what}: {refusal.detail}"
 
 
-def _refuse_contradictions(parameters: TrackingParameters, calibration: Calibration | None) -> None:
+def _refuse_contradictions(
+    parameters: TrackingParameters, calibration: Calibration | None, *, by_notch: bool
+) -> None:
     """Raise PerceptionError where two settings say different things of the lens, or one needs another."""
     placed = not any(isnan(number) for number in parameters.body_to_shaft_translation)
+    if by_notch and parameters.scope_turn_body:
+        raise PerceptionError(
+            "scope_turn_notch and scope_turn_body both say how far the scope is turned: leave one of them out"
+        )
     if calibration is None:
+        if by_notch:
+            raise PerceptionError("scope_turn_notch needs a calibration_file of calibrate oblique")
         if parameters.scope_turn_body:
             raise PerceptionError("scope_turn_body needs a calibration_file that was made with that body")
         if not placed:
@@ -262,6 +337,8 @@ def _refuse_contradictions(parameters: TrackingParameters, calibration: Calibrat
             )
         return
     calibration.require_lens()
+    if by_notch:
+        calibration.require_notch()
     defaults = {field.name: field.default for field in fields(TrackingParameters)}
     # NaN, which is not given, is unlike itself.
     others = [name for name in PLACE_OF_LENS[1:] if getattr(parameters, name) != defaults[name]]
@@ -277,7 +354,12 @@ def _refuse_contradictions(parameters: TrackingParameters, calibration: Calibrat
             f"scope_turn_body is '{parameters.scope_turn_body}', and the calibration knows no second body on "
             "the scope: run calibrate oblique --scope-pose-topic"
         )
-    if by_body and not parameters.scope_turn_body and calibration.require_lens().mount is Mount.CAMERA_HEAD:
+    if (
+        by_body
+        and not by_notch
+        and not parameters.scope_turn_body
+        and calibration.require_lens().mount is Mount.CAMERA_HEAD
+    ):
         raise PerceptionError(
             "the calibration was made with a second body on the scope: name it in scope_turn_body, or the "
             "turn of the scope is not known"

@@ -1,23 +1,23 @@
 """tracking_node: the tracked scope in, from a topic or Motive; scope_pose, the lens with its error, out."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
-from knee_gap_msgs.msg import ScopeCalibration
+from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration
+from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration, notch_from_message
 from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
 from knee_gap_perception.optitrack.scope_feed import SCOPE, ScopeFeed, SourceParameters
-from knee_gap_perception.pose_validity import ValidityParameters
+from knee_gap_perception.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.poses import LensPose
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 
@@ -37,7 +37,9 @@ class TrackingNode(BaseNode):
         self._accepted_before = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
-            self._tracker = ScopeTracker(parameters, validity, calibration.load())
+            self._tracker = ScopeTracker(
+                parameters, validity, calibration.load(), by_notch=calibration.scope_turn_notch
+            )
             others = tuple(name for name in (parameters.reference_body, parameters.scope_turn_body) if name)
             self._feed = ScopeFeed(source, natnet, other_bodies=others, ros_now=self.now_ns)
         except PerceptionError as error:
@@ -45,6 +47,10 @@ class TrackingNode(BaseNode):
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         told = fill_scope_calibration(ScopeCalibration(), "tracking_node", self._tracker.calibration)
         self._calibration.publish(told)
+        # Images and what Motive sends come in threads of their own.
+        self._one_at_a_time = threading.Lock()
+        if calibration.scope_turn_notch:
+            self.create_subscription(ScopeNotch, "scope_notch", self.on_notch, RESULT_QOS)
         self._ended = threading.Event()
         self._receiver: threading.Thread | None = None
         if isinstance(self._feed.source, PoseTopics):
@@ -98,7 +104,17 @@ class TrackingNode(BaseNode):
     def publish_polled(self, timeout: float) -> None:
         """Publish the lens pose of each new frame, or log why there is none."""
         for body, others in self._feed.poll(timeout):
-            lens = self._tracker.update(body, others)
+            with self._one_at_a_time:
+                self.publish_lenses(self._tracker.take(body, others))
+
+    def on_notch(self, message: ScopeNotch) -> None:
+        """Take where the notch is in an image, and publish the pose of the lens at its stamp."""
+        with self._one_at_a_time:
+            self.publish_lenses(self._tracker.take_notch(notch_from_message(message)))
+
+    def publish_lenses(self, lenses: Iterable[LensPose | Refusal]) -> None:
+        """Publish poses of the lens, and log why there are none."""
+        for lens in lenses:
             if isinstance(lens, LensPose):
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
@@ -121,13 +137,15 @@ class TrackingNode(BaseNode):
             f"refused: {reason}": count for reason, count in dict(self._tracker.validity.counts).items()
         }
         words = f"{accepted} poses in the last second" if source.ok else source.words
+        if source.ok and not accepted and self._tracker.notch_flaw:
+            words = self._tracker.notch_flaw
         counts: dict[str, object] = {
             "calibration": hash_or_none(self._tracker.calibration),
             "accepted": self._tracker.accepted_count,
             **source.values,
             **refused,
         }
-        if self._tracker.parameters.scope_turn_body:
+        if self._tracker.parameters.scope_turn_body or self._tracker.by_notch:
             counts["turn of the scope [rad]"] = self._tracker.turn
         return source.ok and accepted > 0, words, counts
 

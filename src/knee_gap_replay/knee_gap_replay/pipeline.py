@@ -15,12 +15,18 @@ from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration
+from knee_gap_perception.messages_tracking import (
+    fill_lens_pose,
+    fill_scope_calibration,
+    fill_scope_notch,
+    notch_from_message,
+)
+from knee_gap_perception.notch_follower import NotchSight
 from knee_gap_perception.optitrack.body_source import choose_body
 from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.scope_feed import SCOPE, SourceParameters
-from knee_gap_perception.pose_validity import ValidityParameters
+from knee_gap_perception.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.poses import LensPose
 from knee_gap_perception.segmentation_parameters import PoseParameters
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
@@ -71,9 +77,15 @@ class GapPipeline:
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
         edges, poses, calibration_of_camera = built["segmentation_node"]
         tracking, validity, calibration_of_lens, source, _ = built["tracking_node"]
+        if calibration_of_camera.scope_turn_notch != calibration_of_lens.scope_turn_notch:
+            raise BagError("scope_turn_notch must be the same for segmentation_node and tracking_node")
         try:
-            stream = EdgeStream(edges, poses, calibration_of_camera.load())
-            tracker = ScopeTracker(tracking, validity, calibration_of_lens.load())
+            stream = EdgeStream(
+                edges, poses, calibration_of_camera.load(), by_notch=calibration_of_camera.scope_turn_notch
+            )
+            tracker = ScopeTracker(
+                tracking, validity, calibration_of_lens.load(), by_notch=calibration_of_lens.scope_turn_notch
+            )
         except PerceptionError as error:
             raise BagError(str(error)) from None
         return cls(
@@ -138,6 +150,11 @@ class GapPipeline:
                 **self.outputs,
                 self._topic("scope_calibration"): ("knee_gap_msgs/msg/ScopeCalibration", "latched"),
             }
+        if tracker.by_notch:
+            self.outputs = {
+                **self.outputs,
+                self._topic("scope_notch"): ("knee_gap_msgs/msg/ScopeNotch", "reliable"),
+            }
         if with_mask:
             self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
@@ -159,7 +176,9 @@ class GapPipeline:
         elif topic in self._body_names:
             yield from self._on_body_pose(self._body_names[topic], message)
         else:
-            self._detector.on_image(message, self._now_ns)
+            sight = self._detector.on_image(message, self._now_ns)
+            if sight is not None:
+                yield from self._on_notch(sight, str(message.header.frame_id))
         yield from self._looked_at(self._detector.ready(self._now_ns))
 
     def flaws(self) -> list[str]:
@@ -182,7 +201,16 @@ class GapPipeline:
         self._bodies.put(name, message)
         for frame in self._bodies.poll():
             body, others = choose_body(frame, SCOPE)
-            lens = self._tracker.update(body, others) if body is not None else None
+            if body is not None:
+                yield from self._on_lenses(self._tracker.take(body, others))
+
+    def _on_notch(self, sight: NotchSight, frame_id: str) -> Iterator[Output]:
+        told = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), sight, frame_id)
+        yield Output(self._topic("scope_notch"), told, sight.stamp_ns)
+        yield from self._on_lenses(self._tracker.take_notch(notch_from_message(told)))
+
+    def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output]:
+        for lens in lenses:
             if not isinstance(lens, LensPose):
                 continue
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)

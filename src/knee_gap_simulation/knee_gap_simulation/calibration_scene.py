@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.notch import Notch
 from knee_gap_simulation.rigid import FloatArray, transform
 from knee_gap_simulation.scope import Scope
 
@@ -16,8 +17,6 @@ ByteImage = npt.NDArray[np.uint8]
 
 TEXTURE_PX_PER_M = 26_000  # 0.038 mm: about a pixel of the picture at the working distance
 TABLE_MARGIN = 0.030  # [m] of table around the board
-NOTCH_HALF_WIDTH = np.radians(2.6)
-NOTCH_DEPTH = 0.055  # of the field's radius
 WORKING_DISTANCE = 0.024
 NOISE_FRAMES = 6  # drawn once, then rolled at random: drawing is the slowest part of a picture
 TINT_BGR = (0.86, 0.93, 1.0)
@@ -148,9 +147,7 @@ class BoardCamera:
         self._crop = (slice(top, min(bottom, lens.height_px)), slice(left, min(right, lens.width_px)))
         pixels = lens.pixel_grid()[self._crop]
         self._bearings = np.nan_to_num(lens.bearings(pixels), nan=0.0).astype(np.float32)
-        offset = (pixels - (lens.centre_x_px, lens.centre_y_px)).astype(np.float32)
-        self._radius = np.hypot(offset[..., 0], offset[..., 1]) / np.float32(lens.radius_px)
-        self._angle = np.arctan2(offset[..., 1], offset[..., 0])
+        self._notch = Notch(lens, self._crop)
         self._stop = lens.field_stop()[self._crop]
         self._noise = self._rng.standard_normal((NOISE_FRAMES, *self._stop.shape), dtype=np.float32)
 
@@ -174,7 +171,7 @@ class BoardCamera:
         shade = (np.float32(WORKING_DISTANCE) / depth) ** 2 * towards
         # Automatic exposure: the bright parts of the picture end up at the same level.
         shade /= max(1e-6, float(np.percentile(shade[::16, ::16][self._stop[::16, ::16] > 0.5], 80)))
-        light = cv2.GaussianBlur(light * shade, (0, 0), 0.8) * self._stop * self._notch(turn)
+        light = cv2.GaussianBlur(light * shade, (0, 0), 0.8) * self._stop_at(turn)
         noise = np.roll(self._noise[self._rng.integers(NOISE_FRAMES)], self._rng.integers(len(light)), axis=0)
         noisy = np.clip(light + 0.008 * noise * np.sqrt(light + 0.05), 0.0, 1.0)
         display = 250 * cv2.pow(noisy, 1 / 1.8)
@@ -182,9 +179,6 @@ class BoardCamera:
         image[self._crop] = cv2.merge([cv2.convertScaleAbs(display, alpha=tint) for tint in TINT_BGR])
         return image
 
-    def _notch(self, turn: float) -> npt.NDArray[np.float32]:
-        """A black triangle on the field stop that points inwards."""
-        away = (self._angle - self._scope.notch_angle - turn + np.pi) % (2 * np.pi) - np.pi
-        height = NOTCH_DEPTH * (1 - np.abs(away) / NOTCH_HALF_WIDTH)
-        inside = (1 - height - self._radius) * self._lens.radius_px
-        return np.where(height > 0, np.clip(inside + 0.5, 0, 1), 1).astype(np.float32)
+    def _stop_at(self, turn: float) -> npt.NDArray[np.float32]:
+        """Share of light that passes the field stop."""
+        return np.asarray(self._stop * self._notch.light(self._scope.notch_angle + turn))

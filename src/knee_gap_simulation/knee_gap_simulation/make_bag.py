@@ -8,6 +8,8 @@ from heapq import merge
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from tqdm import tqdm
 
 from knee_gap_replay.errors import BagError
@@ -19,6 +21,7 @@ from knee_gap_simulation.calibration_bag import (
     calibration_truth,
     make_calibration_bag,
 )
+from knee_gap_simulation.calibration_scene import TurnedScope
 from knee_gap_simulation.clocks import image_times, stamp_ns, tracker_times
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import Hardness
@@ -33,10 +36,13 @@ from knee_gap_simulation.recording import (
     write_recording,
 )
 from knee_gap_simulation.render import ScopeCamera
+from knee_gap_simulation.rigid import FloatArray, inverse
 from knee_gap_simulation.rims import RimScene
-from knee_gap_simulation.scope import Scope
 from knee_gap_simulation.tracker import track_lens, world_from_scene
 from knee_gap_simulation.truth import SceneTruth
+
+TURN_BEGIN_S = 0.5
+TURN_PERIOD_S = 4.0  # of a turn to and fro
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,9 @@ class Recording:
     """A recording of the simple scene of two rims. Lengths [m], times [s].
 
     `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording;
-    without it they are the nominal ones. `video_delay`: how late images are stamped.
+    without it they are the nominal ones. `video_delay`: how late images are stamped. `turn` [rad]: how far
+    that scope is turned to and fro in its camera head, which carries the tracked body; its notch is seen
+    then.
     """
 
     gap: float = 0.004
@@ -56,6 +64,7 @@ class Recording:
     quality: int = 60
     scope_of: int | None = None
     video_delay: float = 0.0
+    turn: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.duration_s <= 600.0:
@@ -69,6 +78,35 @@ class Recording:
                 raise SimulationError(f"the seed must not be negative, but is {seed}")
         if not abs(self.video_delay) <= 0.2:
             raise SimulationError(f"the video's delay must lie in [-0.2, 0.2] s, not {self.video_delay:g} s")
+        if self.turn is not None and self.scope_of is None:
+            raise SimulationError("only a scope of a calibration bag is turned: say --scope-of as well")
+
+    def turn_at(self, time: npt.ArrayLike) -> FloatArray:
+        """Turn [rad] of the scope in its camera head at times (...) [s]."""
+        since = np.maximum(np.asarray(time, dtype=np.float64) - TURN_BEGIN_S, 0.0)
+        return np.asarray((self.turn or 0.0) * 0.5 * (1.0 - np.cos(2.0 * np.pi * since / TURN_PERIOD_S)))
+
+
+class _View:
+    """Where the lens is in the scene, and where its notch is in the picture, at any time [s]."""
+
+    def __init__(self, recording: Recording, motion: HandMotion, scope: TurnedScope) -> None:
+        self._recording, self._motion, self._scope = recording, motion, scope
+        self._T_lens_body = inverse(scope.body_to_lens(0.0))
+
+    def lens(self, time: float) -> FloatArray:
+        """``T_scene_lens`` (4, 4): the hand moves the camera head, in which the scope turns."""
+        straight = self._motion.poses(time)
+        if self._recording.turn is None:
+            return straight
+        turn = float(self._recording.turn_at(time))
+        return np.asarray(straight @ self._T_lens_body @ self._scope.body_to_lens(turn))
+
+    def notch(self, time: float) -> float | None:
+        """Angle of the notch [rad]; None for a scope that shows none."""
+        if self._recording.turn is None:
+            return None
+        return self._scope.notch_angle + float(self._recording.turn_at(time))
 
 
 def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> SceneTruth:
@@ -79,20 +117,22 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
     """
     scene = RimScene.random(recording.gap, recording.seed)
     motion = HandMotion(travel=recording.travel, depth=recording.depth, seed=recording.seed)
-    lens, scope = Lens(), Scope()
+    lens, turned = Lens(), TurnedScope()
     if recording.scope_of is not None:
         calibrated = calibration_truth(CalibrationRecording(seed=recording.scope_of))
-        lens, scope = calibrated.lens, calibrated.scope.scope
-    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, scope)
+        lens, turned = calibrated.lens, calibrated.scope
+    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, turned.scope)
     times = tracker_times(recording.duration_s, recording.fps)
-    lenses = truth.T_world_scene @ motion.poses(times.clip(0.0))
-    bodies = track_lens(lenses, truth.scope.body_to_lens(), recording.seed)
+    view = _View(recording, motion, turned)
+    lenses = truth.T_world_scene @ np.array([view.lens(time) for time in times.clip(0.0)])
+    on_body = np.array([turned.body_to_lens(float(turn)) for turn in recording.turn_at(times)])
+    bodies = track_lens(lenses, on_body, recording.seed)
     _write(
         path,
         truth,
         merge(
-            pose_samples(times, bodies, lenses, truth.scope),
-            _rim_images(recording, truth, motion, progress=progress),
+            pose_samples(times, bodies, lenses, on_body),
+            _rim_images(recording, truth, view, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
         recording=vars(recording),
@@ -108,7 +148,7 @@ def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTr
         path,
         truth,
         merge(
-            pose_samples(times, bodies, lenses, bench.scope),
+            pose_samples(times, bodies, lenses, bench.scope.body_to_lens()),
             _knee_images(bench, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
@@ -122,17 +162,15 @@ def _write(path: Path, truth: SceneTruth, samples: Iterator[Sample], **settings:
     write_parameters(path / PARAMETERS_FILE, truth.scope)
 
 
-def _rim_images(
-    recording: Recording, truth: SceneTruth, motion: HandMotion, *, progress: bool
-) -> Iterator[Sample]:
+def _rim_images(recording: Recording, truth: SceneTruth, view: _View, *, progress: bool) -> Iterator[Sample]:
     sensor = Sensor(shot_noise=0.003, read_noise=0.0006)
     assert isinstance(truth.scene, RimScene)
     camera = ScopeCamera(truth.scene, truth.lens, sensor=sensor, seed=recording.seed)
     times = image_times(recording.duration_s, recording.fps)
     with _Told(len(times), progress=progress) as told:
         for time in times:
-            T_scene_lens = motion.poses(time)
-            image = camera.frame(T_scene_lens, 1.0 / recording.fps)
+            T_scene_lens = view.lens(time)
+            image = camera.frame(T_scene_lens, 1.0 / recording.fps, view.notch(time))
             told.one_more()
             yield Sample(
                 stamp_ns(time + recording.video_delay),
@@ -223,6 +261,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--board", choices=BOARDS, help="to calibrate from (charuco)")
     parser.add_argument("--lens", choices=LENSES, help="to calibrate (equidistant)")
     parser.add_argument(
+        "--turn-deg",
+        type=float,
+        help="turn that scope to and fro in its camera head, its notch in the picture (it shows none)",
+    )
+    parser.add_argument(
         "--scope-of", type=int, metavar="SEED", help="the rims seen by the scope of this calibration bag"
     )
     return parser
@@ -260,6 +303,7 @@ def _rims(arguments: argparse.Namespace) -> Recording:
         quality=defaults.quality if arguments.quality is None else arguments.quality,
         scope_of=arguments.scope_of,
         video_delay=1e-3 * (arguments.video_delay_ms or 0.0),
+        turn=None if arguments.turn_deg is None else float(np.radians(arguments.turn_deg)),
     )
 
 
@@ -290,7 +334,10 @@ def _told_times(times: Iterator[float], count: int) -> Iterator[float]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a bag; 0 when it is made."""
     arguments = _parser().parse_args(argv)
-    of_rims = arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
+    turned = arguments.turn_deg is not None
+    of_rims = (
+        turned or arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
+    )
     of_a_knee = arguments.hardness or arguments.no_gap or arguments.travel_direction
     try:
         if (arguments.board or arguments.lens) and not arguments.calibration:
@@ -301,7 +348,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             make_calibration_bag(arguments.out, _calibration(arguments), _told_times)
         elif arguments.level is not None or of_a_knee:
             if of_rims:
-                raise SimulationError("--scope-of and --video-delay-ms are for the rims, not for a knee")
+                raise SimulationError(
+                    "--scope-of, --turn-deg and --video-delay-ms are for the rims, not for a knee"
+                )
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))

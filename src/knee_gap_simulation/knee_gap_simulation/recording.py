@@ -46,10 +46,13 @@ class Sample:
 
 
 def pose_samples(
-    times: FloatArray, T_world_body: FloatArray, T_world_lens: FloatArray, scope: Scope
+    times: FloatArray, T_world_body: FloatArray, T_world_lens: FloatArray, T_body_lens: FloatArray
 ) -> Iterator[Sample]:
-    """The tracker's samples at times (n,) [s]: reported bodies (n, 4, 4), those of true lenses (n, 4, 4)."""
-    true = T_world_lens @ inverse(scope.body_to_lens())
+    """The tracker's samples at times (n,) [s]: reported bodies (n, 4, 4), those of true lenses (n, 4, 4).
+
+    The lens on the body is (4, 4), or (n, 4, 4) where the scope is turned in its camera head.
+    """
+    true = T_world_lens @ inverse(T_body_lens)
     for time, body, body_true in zip(times, T_world_body, true, strict=True):
         yield Sample(stamp_ns(time), T_world_body=body, T_world_body_true=body_true)
 

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from knee_gap_simulation.imaging import AutoExposure, ByteImage, Sensor, develop
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.notch import Notch
 from knee_gap_simulation.rigid import FloatArray
 from knee_gap_simulation.shading import Light, shade
 from knee_gap_simulation.textures import FloatImage
@@ -52,6 +53,7 @@ class ScopeCamera:
         self._box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
         self._stop = np.ascontiguousarray(stop[self._box])
         self._inside = self._stop > 0.0
+        self._notch = Notch(self.lens, self._box)
         # Rays of the soft border go a hair's breadth beyond the field of view: take the bearing of the rim
         # there.
         pixels = self.lens.pixel_grid()[self._box][self._inside]
@@ -70,12 +72,20 @@ class ScopeCamera:
         image[self._inside] = shade(*hits, self._textures, T_scene_lens, self.light)
         return image
 
-    def frame(self, T_scene_lens: FloatArray, step_s: float = 1.0 / 60.0) -> ByteImage:
-        """The next picture (height, width, 3) bgr8, ``step_s`` after the last one."""
+    def frame(
+        self, T_scene_lens: FloatArray, step_s: float = 1.0 / 60.0, notch_angle: float | None = None
+    ) -> ByteImage:
+        """The next picture (height, width, 3) bgr8, ``step_s`` after the last one.
+
+        With ``notch_angle`` [rad] the field stop has a notch there, from the picture's x towards its y.
+        """
         light = self.radiance(T_scene_lens)
+        stop = self._stop
+        if notch_angle is not None:
+            stop = np.asarray(stop * self._notch.light(notch_angle))
         gain = self._exposure.gain(light, self._stop, step_s)
         rng = np.random.default_rng([self._seed, 0x4E4F, self._frame])
         self._frame += 1
         picture = np.zeros((self.lens.height_px, self.lens.width_px, 3), np.uint8)
-        picture[self._box] = develop(light, self._stop, gain, self.sensor, rng)
+        picture[self._box] = develop(light, stop, gain, self.sensor, rng)
         return picture

@@ -12,6 +12,7 @@ from ruamel.yaml.error import YAMLError
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.calibration.intrinsics import Intrinsics
+from knee_gap_perception.calibration.notch import NotchShape
 from knee_gap_perception.calibration.rigid import Array, rigid
 from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turn_between, turned_lens
 from knee_gap_perception.errors import PerceptionError
@@ -48,7 +49,8 @@ class Oblique:
     """What tells the turn of the scope in its camera head: the shaft's axis, and where it was calibrated.
 
     `notch_angle` [rad] is where the notch stood, NaN where it was not seen; `T_head_scope` (4, 4) where a
-    second tracked body on the scope stood against the one on the camera head, None without one.
+    second tracked body on the scope stood against the one on the camera head, None without one; `notch_shape`
+    what the notch looks like, None where it was not seen or the file is of before it was kept.
     """
 
     notch_angle: float
@@ -56,6 +58,7 @@ class Oblique:
     axis_tilt_sigma: float
     axis_shift_sigma: float
     T_head_scope: Array | None = None
+    notch_shape: NotchShape | None = None
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,20 @@ class Calibration:
             raise PerceptionError("the calibration does not say where the lens is: run calibrate hand_eye")
         return self.lens
 
+    def require_notch(self) -> NotchShape:
+        """What the notch looks like, where all is known that its angle tells the lens by.
+
+        Raises PerceptionError where something is not.
+        """
+        oblique = self.oblique
+        if oblique is None or oblique.notch_shape is None or not np.isfinite(oblique.notch_angle):
+            raise PerceptionError("the calibration does not know the notch: run calibrate oblique")
+        if oblique.axis is None and self.require_lens().mount is Mount.CAMERA_HEAD:
+            raise PerceptionError(
+                "the calibration does not know the axis that the scope turns about: run calibrate oblique"
+            )
+        return oblique.notch_shape
+
     def body_to_lens(self, scope_turn: float = 0.0) -> Array:
         """`T_body_lens` (4, 4) at a turn [rad] of the scope in its camera head since the calibration.
 
@@ -123,6 +140,18 @@ class Calibration:
         return turned_lens(
             lens.T_body_lens, scope_turn, lens.mount, self.oblique.axis if self.oblique else None
         )
+
+    def motion_by_turn(self, T_body_lens: Array) -> Array:
+        """How the lens at (4, 4) on the body moves with the turn of the scope, in the frame of the body.
+
+        (6,): position [m/rad], rotation [-]. Raises PerceptionError where the lens was not calibrated.
+        """
+        position, rotation = np.zeros(3), -T_body_lens[:3, 2]
+        axis = self.oblique.axis if self.oblique else None
+        if self.require_lens().mount is Mount.CAMERA_HEAD and axis is not None:
+            position = np.cross(axis.direction, T_body_lens[:3, 3] - axis.point)
+            rotation = rotation + axis.direction
+        return np.concatenate([position, rotation])
 
     def tracking_parameters(self) -> dict[str, list[float] | float]:
         """What of this goes into `tracking_node`'s parameters, by their names.
@@ -243,6 +272,10 @@ def _to_dict(calibration: Calibration) -> dict[str, Any]:
             # Rounding a rotation matrix to a quaternion and back would change the hash.
             "T_head_scope": _numbers(oblique.T_head_scope) if oblique.T_head_scope is not None else None,
         }
+        # Left out where it is not known, so that older files keep their hash.
+        if oblique.notch_shape is not None:
+            content["oblique"]["notch_depth"] = oblique.notch_shape.depth
+            content["oblique"]["notch_width"] = oblique.notch_shape.width
     if tip is not None:
         content["tip"] = {
             "position": _numbers(tip.position),
@@ -306,7 +339,10 @@ def _oblique(values: dict[str, Any]) -> Oblique:
     sigmas = float(values["axis_tilt_sigma"]), float(values["axis_shift_sigma"])
     second = values["T_head_scope"]
     T_head_scope = _array(second, 4, 4) if second is not None else None
-    return Oblique(float(values["notch_angle"]), axis, *sigmas, T_head_scope)
+    shape = None
+    if "notch_depth" in values:
+        shape = NotchShape(float(values["notch_depth"]), float(values["notch_width"]))
+    return Oblique(float(values["notch_angle"]), axis, *sigmas, T_head_scope, shape)
 
 
 def _tip(values: dict[str, Any]) -> Tip:

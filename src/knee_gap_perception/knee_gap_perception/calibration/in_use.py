@@ -4,12 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
 
 
 @dataclass(frozen=True)
 class CalibrationParameters:
-    """Which calibration is used."""
+    """Which calibration is used, and whether the scope is turned. Raises PerceptionError for a bad value."""
 
     calibration_file: str = field(
         default="",
@@ -18,9 +19,19 @@ class CalibrationParameters:
             "segmentation_node and tracking_node; empty: none"
         },
     )
+    scope_turn_notch: bool = field(
+        default=False,
+        metadata={
+            "description": "Whether the notch in each image tells how far an oblique scope is turned in its "
+            "camera head; the same for segmentation_node and tracking_node; needs a calibration_file of "
+            "`calibrate oblique`"
+        },
+    )
 
     def __post_init__(self) -> None:
         check_parameters(self)
+        if not isinstance(self.scope_turn_notch, bool):
+            raise PerceptionError(f"scope_turn_notch must be true or false, not {self.scope_turn_notch!r}")
 
     def load(self) -> Calibration | None:
         """The calibration, None where none is named. Raises PerceptionError where it cannot be used."""

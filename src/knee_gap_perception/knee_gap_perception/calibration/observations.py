@@ -9,7 +9,7 @@ import numpy.typing as npt
 from knee_gap_perception.calibration.bag_input import CalibrationBag
 from knee_gap_perception.calibration.boards import Board, BoardView
 from knee_gap_perception.calibration.hand_eye_bundle import TrackedView
-from knee_gap_perception.calibration.notch import find_notch
+from knee_gap_perception.calibration.notch import Notch, find_notch
 from knee_gap_perception.calibration.pose_track import PoseTrack
 from knee_gap_perception.calibration.rigid import Array
 from knee_gap_perception.errors import PerceptionError
@@ -19,10 +19,15 @@ LEVER = 0.2  # [m] from body to lens: what turns a body's rotation into motion o
 
 
 class Observation(NamedTuple):
-    """A view of the board, and the angle of the notch [rad], NaN where it was not found."""
+    """A view of the board, and the notch, None where it was not found."""
 
     board: BoardView
-    notch_angle: float
+    notch: Notch | None
+
+    @property
+    def notch_angle(self) -> float:
+        """Angle of the notch [rad], NaN where it was not found."""
+        return self.notch.angle if self.notch else float("nan")
 
 
 class Observations(NamedTuple):
@@ -79,7 +84,7 @@ def observe(
         if view is not None:
             field = finder.find(image)
             notch = find_notch(image, field) if field is not None else None
-            views.append(Observation(view, notch.angle if notch else float("nan")))
+            views.append(Observation(view, notch))
     images.close()
     if size is None:
         raise PerceptionError(f"no image of {topic} is in this part of {bag.path}")

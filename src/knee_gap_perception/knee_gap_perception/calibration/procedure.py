@@ -13,7 +13,7 @@ from knee_gap_perception.calibration.hand_eye import HandEye, HandEyeSettings, c
 from knee_gap_perception.calibration.image_motion import image_motion
 from knee_gap_perception.calibration.intrinsics import IntrinsicsFit, fit_intrinsics
 from knee_gap_perception.calibration.lens_model import LensModel
-from knee_gap_perception.calibration.notch import NOTCH_SIGMA
+from knee_gap_perception.calibration.notch import NOTCH_SIGMA, common_shape
 from knee_gap_perception.calibration.observations import Observations, common_angle, tracked_views, wrapped
 from knee_gap_perception.calibration.observed_turns import FIXED_TURN, turns_by_body, turns_by_notch
 from knee_gap_perception.calibration.pivot import calibrate_pivot
@@ -93,7 +93,8 @@ class Procedure:
             self._report(
                 f"notch at {np.degrees(reference):.2f} deg; until calibrate oblique, do not turn the scope"
             )
-            oblique = Oblique(reference, None, float("nan"), float("nan"))
+            shape = common_shape([view.notch for view in seen.views])
+            oblique = Oblique(reference, None, float("nan"), float("nan"), notch_shape=shape)
         return _kept(known, seen, **self._parts(known, found), oblique=oblique)
 
     def oblique(self, calibration: Calibration | None) -> Calibration:
@@ -128,7 +129,8 @@ class Procedure:
                 f"{np.degrees(np.arccos(found.axis.direction @ found.T_body_lens[:3, 2])):.2f} deg oblique "
                 "to it"
             )
-        oblique = Oblique(notch, found.axis, tilt, shift, T_head_scope)
+        shape = common_shape([view.notch for seen in parts for view in seen.views])
+        oblique = Oblique(notch, found.axis, tilt, shift, T_head_scope, shape)
         return _kept(known, parts[0], **self._parts(known, found), oblique=oblique)
 
     def pivot(self, calibration: Calibration | None) -> Calibration:

@@ -1,0 +1,170 @@
+"""An oblique scope that is turned in its camera head while it measures: its notch tells by how much."""
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from live import Client
+
+from knee_gap_bringup.comparison import compare
+from knee_gap_bringup.processes import Processes, executable
+from knee_gap_msgs.msg import GapEstimate, ScopeNotch
+from knee_gap_perception.calibration.calibration_file import load_calibration
+from knee_gap_perception.calibration.command import main as calibrate
+from knee_gap_replay.bag import BagReader
+from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
+from knee_gap_simulation.make_bag import Recording, make_bag
+from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE
+
+DOMAIN = 63
+ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+SEED = 61
+TURNED = Recording(
+    seed=32, duration_s=3.5, fps=30.0, scope_of=SEED, video_delay=0.012, turn=float(np.radians(-25.0))
+)
+VALID, TRACKING_LOST = GapEstimate.STATUS_VALID, GapEstimate.STATUS_TRACKING_LOST
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `calibrate oblique` writes from a bag in which the light post is turned as well."""
+    folder = tmp_path_factory.mktemp("calibration")
+    make_calibration_bag(
+        folder / "board", CalibrationRecording(seed=SEED, fps=5, board_s=8, oblique_s=8, pivot_s=0)
+    )
+    for step in ("intrinsics", "oblique"):
+        into = ["--board", "charuco:12x9:3:2", "--into", str(folder / "scope.yaml"), "--views", "24"]
+        assert calibrate([step, str(folder / "board"), *into]) == 0
+    return folder / "scope.yaml"
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bag = tmp_path_factory.mktemp("turned") / "bag"
+    make_bag(bag, TURNED, progress=False)
+    return bag
+
+
+def parameters(folder: Path, calibration: Path, *by_notch: bool) -> Path:
+    """Parameters of segmentation_node and tracking_node."""
+    lines = []
+    for node, notch in zip(("segmentation_node", "tracking_node"), by_notch, strict=True):
+        lines += [f"/**/{node}:", "  ros__parameters:", f'    calibration_file: "{calibration}"']
+        lines += [f"    scope_turn_notch: {str(notch).lower()}"]
+    path = folder / "parameters.yaml"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def process(bag: Path, out: Path, file: Path) -> "subprocess.CompletedProcess[str]":
+    command = [executable("knee_gap_replay", "process"), str(bag), str(out), "--params-file", str(file)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def messages(bag: Path, topic: str) -> list[Any]:
+    with BagReader(bag) as reader:
+        return [reader.deserialize(entry) for entry in reader.messages([topic])]
+
+
+def test_the_gap_is_right_while_the_scope_turns(calibration: Path, turned: Path, tmp_path: Path) -> None:
+    done = process(turned, tmp_path / "out", parameters(tmp_path, calibration, True, True))
+    assert done.returncode == 0, done.stderr
+    comparison = compare(turned, tmp_path / "out")
+    assert comparison.valid.sum() > 40
+    assert comparison.inside == 1.0
+    assert comparison.median_error < 0.15e-3
+    sights = messages(tmp_path / "out", "/knee_gap/scope_notch")
+    seen = {(s.header.stamp.sec, s.header.stamp.nanosec): s.angle for s in sights if s.seen}
+    assert np.ptp(np.unwrap(list(seen.values()))) > np.radians(24)
+    poses = messages(tmp_path / "out", "/knee_gap/scope_pose")
+    # A pose at each image whose notch was seen, and at no other time.
+    assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in poses} == set(seen)
+
+
+def test_a_turn_that_is_not_told_of_makes_it_wrong(calibration: Path, turned: Path, tmp_path: Path) -> None:
+    done = process(turned, tmp_path / "out", parameters(tmp_path, calibration, False, False))
+    assert done.returncode == 0, done.stderr
+    comparison = compare(turned, tmp_path / "out")
+    assert comparison.valid.sum() == 0 or comparison.median_error > 0.5e-3
+
+
+def test_offline_the_two_nodes_must_agree(calibration: Path, turned: Path, tmp_path: Path) -> None:
+    done = process(turned, tmp_path / "out", parameters(tmp_path, calibration, True, False))
+    assert done.returncode == 1
+    assert "scope_turn_notch must be the same" in done.stderr
+
+
+def live(folder: Path, processes: Processes, bag: Path, file: Path) -> None:
+    """Start the nodes, and the bag as slowly as a busy machine needs."""
+    for name, package in (
+        ("segmentation_node", "knee_gap_perception"),
+        ("tracking_node", "knee_gap_perception"),
+        ("uncertainty_node", "knee_gap_uncertainty"),
+    ):
+        command = [executable(package, name), "--ros-args", "-r", "__ns:=/knee_gap"]
+        command += ["-p", "use_sim_time:=true"]
+        if name != "uncertainty_node":
+            command += ["--params-file", str(file)]
+        if name == "segmentation_node":
+            command += ["-p", "image_transport:=compressed"]
+        processes.start(name, command)
+    processes.wait_ready(["segmentation_node", "tracking_node", "uncertainty_node"], 120.0)
+    topics = [IMAGE, CAMERA_INFO, BODY_POSE]
+    play = [executable("knee_gap_replay", "play"), str(bag), "--clock", "--rate", "0.4", "--loop"]
+    processes.start("play", [*play, "--topics", *topics, "--wait-for", *topics, "--delay", "1"])
+
+
+def test_live_it_is_right_too(calibration: Path, turned: Path, tmp_path: Path) -> None:
+    file = parameters(tmp_path, calibration, True, True)
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        for kind, topic in (
+            (GapEstimate, "gap"),
+            (ScopeNotch, "scope_notch"),
+            (PoseWithCovarianceStamped, "scope_pose"),
+        ):
+            client.listen(kind, topic)
+        live(tmp_path, processes, turned, file)
+
+        def valid() -> list[GapEstimate]:
+            return [gap for gap in client.received["gap"] if gap.status == VALID]
+
+        client.spin_until(lambda: len(valid()) > 20, timeout=90.0)
+        assert all(gap.gap_min < TURNED.gap < gap.gap_max for gap in valid())
+        seen = {
+            (s.header.stamp.sec, s.header.stamp.nanosec) for s in client.received["scope_notch"] if s.seen
+        }
+        posed = {(p.header.stamp.sec, p.header.stamp.nanosec) for p in client.received["scope_pose"]}
+        assert posed <= seen
+    assert load_calibration(calibration).require_notch().depth == pytest.approx(0.05, abs=0.01)
+
+
+def test_live_without_word_of_the_notch_nothing_is_valid(
+    calibration: Path, turned: Path, tmp_path: Path
+) -> None:
+    file = parameters(tmp_path, calibration, False, True)
+    with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
+        client.listen(GapEstimate, "gap")
+        client.listen(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(DiagnosticArray, "/diagnostics")
+        live(tmp_path, processes, turned, file)
+        words: set[str] = set()
+
+        def told() -> bool:
+            for array in client.received["/diagnostics"]:
+                words.update(s.message for s in array.status if s.name == "/knee_gap/tracking_node")
+            return (
+                any("nobody tells of the notch" in one for one in words) and len(client.received["gap"]) > 20
+            )
+
+        client.spin_until(told, timeout=90.0)
+        assert not client.received["scope_pose"]
+        assert all(gap.status != VALID and np.isnan(gap.gap) for gap in client.received["gap"])
