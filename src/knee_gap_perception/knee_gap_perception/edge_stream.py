@@ -6,9 +6,13 @@ and not foretold. It waits for nothing else, and not where no pose is to be expe
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from dataclasses import replace
 from math import nan
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from knee_gap_perception.calibration.bearing_errors import BearingErrors
 from knee_gap_perception.calibration.calibration_file import Calibration
 from knee_gap_perception.calibration.camera_check import disagreement
 from knee_gap_perception.camera import Camera, camera_from_info
@@ -77,7 +81,9 @@ class EdgeStream:
         self.calibration = calibration
         # Why the images are none of the calibration's; empty where they are.
         self.size_flaw = ""
+        self._bearing_errors: BearingErrors | None = None
         if calibration is not None:
+            self._bearing_errors = BearingErrors(calibration.require_camera())
             self._camera, self._camera_flaw = calibration.require_camera().camera(), ""
         self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
         self._notch: NotchFollower | None = None
@@ -182,6 +188,8 @@ class EdgeStream:
                 raise PerceptionError(self._camera_flaw)
             lens_pose = self._poses.at(stamp)
             edges = self.detector.process(stamp, image, self._camera, lens_pose, frame_id=frame_id)
+            if self._bearing_errors is not None and np.isfinite(edges.bearings).all():
+                edges = replace(edges, camera_errors=self._bearing_errors.of(edges.bearings))
             self.reason = self.detector.reason
         except PerceptionError as error:
             self.detector.end_track()

@@ -1,6 +1,6 @@
 """Two points of the anatomy, one just inside each edge of the gap, as one image shows them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Self
 
@@ -35,8 +35,9 @@ class GapEdges:
     track; the same id means the same two points. `bearings` (2, 3) are unit vectors, `pixels` (2, 2) columns
     and rows, `covariances` (2, 3, 3) those of the unit vectors [rad^2], and `angular_error` bounds the angle
     between each bearing and its true direction [rad]. `hidden` tells of each point that the image does not
-    show it and it is only carried on; `pose_used` whether the pose of the lens guided the search. Unknown
-    numbers are NaN.
+    show it and it is only carried on; `pose_used` whether the pose of the lens guided the search.
+    `camera_errors` (2, 3, k) are the displacements of the bearings by one standard deviation of each of the k
+    independent errors of the camera's own numbers [rad]. Unknown numbers are NaN.
     """
 
     stamp_ns: int
@@ -50,6 +51,7 @@ class GapEdges:
     angular_error: float
     hidden: tuple[bool, bool] = (False, False)
     pose_used: bool = False
+    camera_errors: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3, 0)))
 
     @classmethod
     def without_points(cls, stamp_ns: int, frame_id: str, status: EdgeStatus, track_id: int = 0) -> Self:

@@ -143,6 +143,7 @@ def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
         setattr(
             message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
         )
+        setattr(message, f"camera_error_{index}", np.array(edges.camera_errors[index], float).ravel())
     message.pose_used = bool(edges.pose_used)
     message.angular_error = float(edges.angular_error)
     return message

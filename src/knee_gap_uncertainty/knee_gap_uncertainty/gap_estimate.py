@@ -33,7 +33,9 @@ class EdgeObservation:
     `usable` is false where the points were not seen; the rest is then unknown. `status` is the sender's code,
     `frame_id` the lens frame. `hidden` is true where a bearing is a prediction from earlier images: those
     have been counted, and counting them again would make the fit too sure. `pose_used` says that the pose of
-    the lens guided the search, so that bearings and pose share some of their errors.
+    the lens guided the search, so that bearings and pose share some of their errors. `camera_errors`
+    (2, 3, k) are the displacements of the bearings by one standard deviation of each of the k errors of the
+    camera's own numbers [rad], which all images share.
     """
 
     stamp_ns: int
@@ -46,6 +48,7 @@ class EdgeObservation:
     frame_id: str = "arthroscope_optical"
     hidden: bool = False
     pose_used: bool = False
+    camera_errors: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3, 0)))
 
     def flaw(self) -> str:
         """Why the observation cannot be used, in words; empty if it can."""
@@ -55,6 +58,8 @@ class EdgeObservation:
             return "a point is hidden in the image: its bearing is a prediction, not a measurement"
         if not (np.isfinite(self.bearings).all() and np.isfinite(self.covariances).all()):
             return "the edges say valid and carry numbers that are not finite"
+        if not np.isfinite(self.camera_errors).all():
+            return "the edges say valid and carry errors of the camera that are not finite"
         if np.abs(np.linalg.norm(self.bearings, axis=1) - 1.0).max() > UNIT_TOLERANCE:
             return "the edges say valid and carry bearings that are no unit vectors"
         if not 0.0 <= self.angular_error < np.pi / 2:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
@@ -33,7 +34,16 @@ def edges_from_message(message: Any) -> EdgeObservation:
         frame_id=str(message.header.frame_id),
         hidden=bool(message.hidden_0) or bool(message.hidden_1),
         pose_used=bool(message.pose_used),
+        camera_errors=_camera_errors(message),
     )
+
+
+def _camera_errors(message: Any) -> npt.NDArray[np.float64]:
+    """Errors (2, 3, k) of a knee_gap_msgs/GapEdges; NaN where their numbers do not fit together."""
+    first, second = (np.array(one, dtype=float) for one in (message.camera_error_0, message.camera_error_1))
+    if first.size != second.size or first.size % 3:
+        return np.full((2, 3, 1), np.nan)
+    return np.array([first.reshape(3, -1), second.reshape(3, -1)])
 
 
 def pose_from_message(message: Any) -> LensPose:

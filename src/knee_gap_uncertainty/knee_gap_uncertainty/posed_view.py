@@ -51,5 +51,6 @@ def posed_view(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> 
             rotation_covariances=turn[None],
             lens_rotations=matrix[None],
             lens_motions=np.nan_to_num(pose.motion)[None],
+            camera_errors=(matrix @ edges.camera_errors)[None],
         ),
     )

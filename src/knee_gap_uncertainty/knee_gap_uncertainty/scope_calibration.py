@@ -1,9 +1,12 @@
 """What the calibration of the scope does to a gap: an error that all views of a track share.
 
 A shift of the lens on its body is felt only where the scope turns between the views, a turn of it turns every
-bearing against the travel, and a clock that is off moves the lens along its way. None of it averages out, so
-it is no part of the covariance of a lens pose: it is considered, as the common part of the image's error is.
-The gap's fit is taken as it is, and to its covariance comes what the shared error does to it.
+bearing against the travel, a clock that is off moves the lens along its way, and a camera whose numbers are
+off turns each bearing by where it lies in the picture. None of it averages out, so it is no part of the
+covariance of a lens pose or a bearing: it is considered, as the common part of the image's error is. The
+gap's fit is taken as it is, and to its covariance comes what the shared error does to it. The camera's errors
+and those of the lens on its body are taken as independent, though one fit has found both and they mostly make
+up for each other.
 """
 
 from dataclasses import dataclass
@@ -54,7 +57,10 @@ def contradiction(told: dict[str, ScopeCalibration]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationError:
-    """The shared error: `covariance` (6, 6) and `clock` [s] as in ScopeCalibration."""
+    """The shared error: `covariance` (6, 6) and `clock` [s] as in ScopeCalibration.
+
+    The camera's is told by the views themselves, as it depends on where a point lies in the picture.
+    """
 
     covariance: Array
     clock: float
@@ -64,7 +70,7 @@ class CalibrationError:
         if not np.isfinite(fit.points).all() or views.lens_rotations is None:
             return fit
         shift = self._moved_points(fit, views)
-        moved = shift @ self._root()
+        moved = shift @ self._root(shift.shape[1])
         return widened(fit, moved @ moved.T)
 
     def bounds(self, first: PosedView, present: PosedView, factor: float) -> tuple[float, float]:
@@ -79,20 +85,24 @@ class CalibrationError:
         motions = [_motions(view.view)[0] for view in (first, present)]
         late = (motions[1][:3] - motions[0][:3]) / 2.0 * self.clock
         turned = max(float(motion[3:] @ motion[3:]) for motion in motions) * self.clock**2
-        angle = np.sqrt(np.trace(turn) + turned)
+        seen = max(_largest_displacement(view.view) for view in (first, present))
+        angle = np.sqrt(np.trace(turn) + turned + seen**2)
         position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late)
         return factor * float(angle), factor * float(position)
 
-    def _root(self) -> Array:
-        """(7, 7) whose product with its transpose is the covariance of shift, rotation and clock."""
-        root = np.zeros((7, 7))
+    def _root(self, count: int) -> Array:
+        """(count, count) whose product with its transpose is the covariance of all shared errors.
+
+        They are shift, rotation and clock, and then those of the camera, which have a variance of 1.
+        """
+        root = np.eye(count)
         values, vectors = np.linalg.eigh(self.covariance)
         root[:6, :6] = vectors * np.sqrt(np.maximum(values, 0.0))
         root[6, 6] = self.clock
         return root
 
     def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
-        """(6, 7): how far the estimated points go with the shared shift, rotation [rad] and clock [s].
+        """(6, 7 + k): how far the estimated points go with shift, rotation [rad], clock [s] and camera.
 
         By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
         moves all lenses alike moves the points with them, and their distance not at all.
@@ -100,11 +110,13 @@ class CalibrationError:
         rotations = views.lens_rotations
         assert rotations is not None
         motions = _motions(views)
-        moved = np.zeros((6, 7))
-        lens_moved = np.zeros((len(views), 3, 7))
+        by_camera = _camera_errors(views)
+        count = 7 + by_camera.shape[-1]
+        moved = np.zeros((6, count))
+        lens_moved = np.zeros((len(views), 3, count))
         lens_moved[:, :, :3] = rotations - rotations[-1]
         lens_moved[:, :, 6] = motions[:, :3] - motions[-1, :3]
-        turned = np.zeros((len(views), 3, 7))
+        turned = np.zeros((len(views), 3, count))
         turned[:, :, 3:6] = rotations
         turned[:, :, 6] = motions[:, 3:]
         lens_variance = np.trace(views.lens_covariances, axis1=1, axis2=2) / 3.0
@@ -120,6 +132,7 @@ class CalibrationError:
             weight = 1.0 / (variance * length**2)
             # A lens that moves takes its ray along; a bearing b that turns by r goes by r x b.
             aside = lens_moved[used] - length[:, None, None] * (_cross(bearing) @ turned[used])
+            aside[:, :, 7:] += length[:, None, None] * by_camera[used, n]
             normal = np.einsum("i,ijk->jk", weight, across)
             right = np.einsum("i,ijk,ikl->jl", weight, across, aside)
             moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
@@ -129,6 +142,16 @@ class CalibrationError:
 def _motions(views: Views) -> Array:
     """(N, 6) velocity [m/s] and turning [rad/s] of the lens; zero where it is not known."""
     return np.zeros((len(views), 6)) if views.lens_motions is None else views.lens_motions
+
+
+def _camera_errors(views: Views) -> Array:
+    """(N, 2, 3, k) displacements of the bearings by the errors of the camera; k is 0 where none are told."""
+    return np.zeros((len(views), 2, 3, 0)) if views.camera_errors is None else views.camera_errors
+
+
+def _largest_displacement(views: Views) -> float:
+    """RMS length [rad] of what the camera's errors do to the bearing that feels them most."""
+    return float(np.sqrt((_camera_errors(views) ** 2).sum(axis=(-2, -1)).max()))
 
 
 def _cross(vectors: Array) -> Array:

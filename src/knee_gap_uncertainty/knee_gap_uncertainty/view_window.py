@@ -3,7 +3,7 @@
 import numpy as np
 
 from knee_gap_uncertainty.errors import BadInputError
-from knee_gap_uncertainty.views import Views
+from knee_gap_uncertainty.views import Views, all_camera_errors
 
 CAPACITY = 240
 # A view is worth keeping where the lens is this many RMS errors of its position away from all views kept: a
@@ -68,6 +68,7 @@ class ViewWindow:
             common_share=common_share,
             lens_rotations=np.concatenate(rotations) if len(rotations) == len(self._views) else None,
             lens_motions=np.concatenate(motions) if len(motions) == len(self._views) else None,
+            camera_errors=all_camera_errors(self._views),
         )
 
     def _is_apart(self, view: Views, others: list[Views]) -> bool:

@@ -1,5 +1,6 @@
 """The views of a track: lens positions and bearings in one frame, with their errors."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,9 @@ class Views:
     `lens_rotations` (N, 3, 3) takes lens coordinates (z optical axis, x right, y down) to the frame of the
     points and so says which way those axes lie; without it the lens is taken to look at the middle of the gap
     and not to roll. `lens_motions` (N, 6) are its velocity [m/s] and turning [rad/s] in the frame of the
-    points, by which the error of a clock moves it; None where they are not known.
+    points, by which the error of a clock moves it; None where they are not known. `camera_errors`
+    (N, 2, 3, k) are displacements of the bearings [rad], one for each error of the camera's own numbers,
+    which all views share; None where there are none.
 
     Raises BadInputError for the first value that breaks a rule.
     """
@@ -42,6 +45,7 @@ class Views:
     common_share: float = 0.5
     lens_rotations: Array | None = None
     lens_motions: Array | None = None
+    camera_errors: Array | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into contiguous float64 and check them."""
@@ -77,6 +81,8 @@ class Views:
             _check_rotations(self.lens_rotations, count)
         if self.lens_motions is not None:
             _check_shape("lens_motions", self.lens_motions, (count, 6))
+        if self.camera_errors is not None:
+            _check_shape("camera_errors", self.camera_errors, (count, 2, 3, self.camera_errors.shape[-1]))
         _check_covariance("bearing_covariances", self.bearing_covariances)
         _check_covariance("lens_covariances", self.lens_covariances)
         _check_covariance("rotation_covariances", self.rotation_covariances)
@@ -106,6 +112,7 @@ class Views:
             lens_motions=None
             if motions[0] is None or motions[1] is None
             else np.concatenate([motions[0], motions[1]]),
+            camera_errors=all_camera_errors([self, other]),
         )
 
     def __len__(self) -> int:
@@ -117,6 +124,14 @@ class Views:
         """(N, 3, 3): rows x, y and optical axis z of the lens in the frame of the points."""
         rotations = _steady_rotations(self.bearings) if self.lens_rotations is None else self.lens_rotations
         return np.ascontiguousarray(np.swapaxes(rotations, -1, -2))
+
+
+def all_camera_errors(parts: Sequence[Views]) -> Array | None:
+    """The camera's errors of several views, one after the other; None where they are not of the same."""
+    errors = [part.camera_errors for part in parts if part.camera_errors is not None]
+    if len(errors) < len(parts) or len({one.shape[-1] for one in errors}) != 1:
+        return None
+    return np.concatenate(errors)
 
 
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:

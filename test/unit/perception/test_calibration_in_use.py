@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_perception.calibration.bearing_errors import BearingErrors
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     Clock,
@@ -168,3 +169,34 @@ def test_what_is_told_of_it_arrives_in_the_order_of_rep_103() -> None:
     nothing = calibration_from_message(fill_scope_calibration(message, "tracking_node", None))
     assert nothing.hash == ""
     assert nothing.error is None
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [("equidistant", (0.01, -0.02, 0.0, 0.0)), ("plumb_bob", (-0.3, 0.1, 0.0, 0.0, 0.0))],
+)
+def test_a_bearing_moves_with_the_cameras_errors_as_one_of_a_wrong_camera(
+    model: str, distortion: tuple[float, ...]
+) -> None:
+    rng, size = np.random.default_rng(4), 4 + len(distortion)
+    root = rng.standard_normal((size, size)) * np.array([0.2] * 4 + [2e-3] * len(distortion))[:, None]
+    root[-1] = 0.0  # a parameter that the fit did not change
+    camera = Intrinsics(
+        1280, 720, model, (460.0, 0.0, 640.0, 0.0, 461.0, 360.0, 0.0, 0.0, 1.0), distortion, root @ root.T,
+        0.1, 0.1, 1.0, 20, 900,
+    )  # fmt: skip
+    pixels = np.array([[640.0, 200.0], [820.0, 420.0]])
+    bearings = camera.camera().bearings(pixels)
+    errors = BearingErrors(camera).of(bearings)
+    assert errors.shape == (2, 3, size - 1)
+    moved = []
+    for column in root.T:
+        parameters = camera.parameters + column
+        k = (parameters[0], 0.0, parameters[2], 0.0, parameters[1], parameters[3], 0.0, 0.0, 1.0)
+        wrong = replace(camera, k=k, d=tuple(parameters[4:]))
+        moved.append(wrong.camera().bearings(pixels) - bearings)
+    for n in range(2):
+        shown = np.array([one[n] for one in moved])
+        np.testing.assert_allclose(
+            errors[n] @ errors[n].T, shown.T @ shown, atol=0.02 * np.trace(shown.T @ shown)
+        )

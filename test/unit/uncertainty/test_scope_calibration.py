@@ -89,6 +89,48 @@ def test_it_counts_as_common_and_shares_still_sum_to_one() -> None:
     assert wider.shares[3] > fitted.shares[3]
 
 
+def camera_errors(views: Views, *columns: int) -> Array:
+    """Displacements (N, 2, 3, k) by errors of an equidistant lens: x and y of the picture, its scale.
+
+    A column's one standard deviation is 1 mrad, or 1 % of the angle to the axis.
+    """
+    rotations = views.lens_rotations
+    assert rotations is not None
+    bearings = np.einsum("nij,nki->nkj", rotations, views.bearings)
+    across = np.linalg.norm(bearings[..., :2], axis=-1)
+    out = np.zeros_like(bearings)
+    out[..., :2] = bearings[..., :2] / across[..., None]
+    along = np.cross(np.cross(bearings, out), bearings)
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    moved = np.zeros((*bearings.shape, 3))
+    for axis in (0, 1):
+        unit = np.eye(3)[axis]
+        moved[..., axis] = 1e-3 * (unit - (bearings @ unit)[..., None] * bearings)
+    moved[..., 2] = 1e-2 * np.arctan2(across, bearings[..., 2])[..., None] * along
+    return np.asarray(np.einsum("nij,nkjc->nkic", rotations, moved[..., list(columns)]))
+
+
+@pytest.mark.parametrize("column", range(3))
+def test_the_cameras_error_is_what_a_refit_with_a_wrong_camera_shows(column: int) -> None:
+    views = scope(20)
+    errors = camera_errors(views, column)
+    gaps = []
+    for sign in (1.0, -1.0):
+        wrong = views.bearings + sign * errors[..., 0]
+        gaps.append(fit(replace(views, bearings=wrong / np.linalg.norm(wrong, axis=-1, keepdims=True))).gap)
+    shown = abs(gaps[0] - gaps[1]) / 2.0
+    assert spread(NOTHING, 0.0, replace(views, camera_errors=errors)) == pytest.approx(
+        shown, rel=0.15, abs=2e-6
+    )
+
+
+def test_the_cameras_errors_add_as_independent_ones_do() -> None:
+    views = scope(20)
+    one = [spread(NOTHING, 0.0, replace(views, camera_errors=camera_errors(views, k))) for k in range(3)]
+    together = spread(NOTHING, 0.0, replace(views, camera_errors=camera_errors(views, 0, 1, 2)))
+    assert together == pytest.approx(np.sqrt(np.sum(np.square(one))), rel=1e-6)
+
+
 def told(node: str, digest: str, *, error: Array | None = None) -> ScopeCalibration:
     return ScopeCalibration(node, digest, np.full((6, 6), np.nan) if error is None else error, 0.0)
 
@@ -102,9 +144,10 @@ def test_nodes_with_different_calibrations_contradict_each_other() -> None:
     assert "x none" in contradiction({"tracking_node": one, "x": none})
 
 
-def estimates(*calibrations: ScopeCalibration) -> list[GapEstimate]:
-    """What the estimator says of 40 views of the travelling scope."""
+def estimates(*calibrations: ScopeCalibration, camera: float = 0.0) -> list[GapEstimate]:
+    """What the estimator says of 40 views of the travelling scope, `camera` times its errors told."""
     estimator, views, found = GapEstimator(), scope(40), []
+    errors = camera * camera_errors(views, 0, 1, 2)
     for calibration in calibrations:
         estimator.add_calibration(calibration)
     assert views.lens_rotations is not None
@@ -113,8 +156,9 @@ def estimates(*calibrations: ScopeCalibration) -> list[GapEstimate]:
         rotation = views.lens_rotations[k]
         bearings = views.bearings[k] @ rotation
         edges = EdgeObservation(
-            stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3
-        )
+            stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3,
+            camera_errors=np.einsum("ij,kic->kjc", rotation, errors[k]),
+        )  # fmt: skip
         pose = LensPose(
             stamp_ns,
             "world",
@@ -144,3 +188,19 @@ def test_both_intervals_include_the_calibrations_error() -> None:
     for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
         assert getattr(with_it, low) < getattr(without, low)
         assert getattr(with_it, high) > getattr(without, high)
+
+
+def test_both_intervals_include_the_cameras_error() -> None:
+    exact = told("tracking_node", "a" * 64, error=NOTHING)
+    without, with_it = estimates(exact)[-1], estimates(exact, camera=3.0)[-1]
+    assert with_it.status is without.status is GapStatus.VALID
+    assert with_it.gap == pytest.approx(without.gap)
+    assert with_it.shares[3] > without.shares[3]
+    for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
+        assert getattr(with_it, low) < getattr(without, low)
+        assert getattr(with_it, high) > getattr(without, high)
+
+
+def test_errors_of_a_camera_that_are_none_give_no_estimate() -> None:
+    wrong = estimates(told("tracking_node", "a" * 64, error=NOTHING), camera=float("nan"))
+    assert {estimate.status for estimate in wrong} == {GapStatus.NO_EDGES}
