@@ -37,7 +37,7 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
         "--restart-every": 45.0,
         "--down-for": 4.0,
     }
-    module = "knee_gap_simulation.natnet_server"
+    module = "knee_gap_simulation.natnet_server_command"
     command = [sys.executable, "-m", module, "--version", arguments.version, "--rate", str(arguments.rate)]
     command += ["--command-port", str(arguments.port), "--data-port", str(arguments.port + 1)]
     if arguments.multicast:

@@ -21,7 +21,7 @@ setup(
         "console_scripts": [
             "contact_sheet = knee_gap_simulation.contact_sheet:main",
             "make_bag = knee_gap_simulation.make_bag:main",
-            "natnet_server = knee_gap_simulation.natnet_server:main",
+            "natnet_server = knee_gap_simulation.natnet_server_command:main",
         ],
     },
 )

@@ -35,6 +35,8 @@ class TrackingNode(BaseNode):
         source, natnet = self.declare(SourceParameters), self.declare(NatNetParameters)
         self.refuse_unknown_parameters()
         self._accepted_before = 0
+        # Since the last diagnostics, and why the last of them was.
+        self._refused, self._why_refused = 0, ""
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
             self._tracker = ScopeTracker(
@@ -118,6 +120,7 @@ class TrackingNode(BaseNode):
             if isinstance(lens, LensPose):
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
+                self._refused, self._why_refused = self._refused + 1, lens.detail
                 self.log_once(lens.reason, f"pose refused: {lens.detail}")
 
     def destroy_node(self) -> None:
@@ -139,6 +142,9 @@ class TrackingNode(BaseNode):
         words = f"{accepted} poses in the last second" if source.ok else source.words
         if source.ok and not accepted and self._tracker.notch_flaw:
             words = self._tracker.notch_flaw
+        elif source.ok and self._refused:
+            words += f", {self._refused} refused: {self._why_refused}"
+        self._refused = 0
         counts: dict[str, object] = {
             "calibration": hash_or_none(self._tracker.calibration),
             "accepted": self._tracker.accepted_count,

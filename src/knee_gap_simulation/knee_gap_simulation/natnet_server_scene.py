@@ -13,6 +13,9 @@ from knee_gap_simulation.rigid import FloatArray
 # from 0 to 1 m in this time [s], in single precision finer than a microsecond.
 CLOCK_SECONDS = 10.0
 CLOCK_NAME = "clock"
+PERIODIC = ("occlusion", "swap", "freeze", "jump")
+# How far a body is said to be away from where it is while it jumps [m]: further than a hand moves in a frame.
+JUMP = (0.06, 0.0, 0.02)
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,16 @@ class Faults:
     occlusion_length: float = 0.3
     swap_period: float = 0.0
     swap_length: float = 0.5
+    freeze_period: float = 0.0
+    freeze_length: float = 0.5
+    jump_period: float = 0.0
+    jump_length: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("lost_share", "invalid_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise SimulationError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
-        for name in ("occlusion_period", "occlusion_length", "swap_period", "swap_length"):
+        for name in (f"{fault}_{part}" for fault in PERIODIC for part in ("period", "length")):
             if getattr(self, name) < 0.0:
                 raise SimulationError(f"{name} must not be negative, not {getattr(self, name)} s")
 
@@ -94,11 +101,17 @@ class TrackedScene:
     def _body(self, number: int, time_s: float) -> BodyInFrame:
         position, rotation = self.true_pose(number, time_s)
         is_clock = self.names[number - 1] == CLOCK_NAME
+        frozen = self._at_fault(number, time_s, self.faults.freeze_period, self.faults.freeze_length)
+        if frozen and number in self._last:
+            # As a driver does that lost its connection: the valid bit still set.
+            return self._last[number]
         if not is_clock and self._hidden(number, time_s) and number in self._last:
             last = self._last[number]
             return BodyInFrame(number, last.position, last.quaternion_xyzw, 0.0, tracking_valid=False)
         if not is_clock:
             position = position + self._rng.normal(0.0, self.noise / 3**0.5, 3)
+            if self._at_fault(number, time_s, self.faults.jump_period, self.faults.jump_length):
+                position = position + JUMP
             rotation = Rotation.from_rotvec(self._rng.normal(0.0, 4e-5, 3)) * rotation
         body = BodyInFrame(number, tuple(position), tuple(rotation.as_quat()), mean_error=2e-4)
         self._last[number] = body
@@ -107,8 +120,12 @@ class TrackedScene:
     def _hidden(self, number: int, time_s: float) -> bool:
         if self._rng.random() < self.faults.invalid_share:
             return True
-        since = time_s - self._start_s
-        return number == 1 and _within(since, self.faults.occlusion_period, self.faults.occlusion_length)
+        faults = self.faults
+        return self._at_fault(number, time_s, faults.occlusion_period, faults.occlusion_length)
+
+    def _at_fault(self, number: int, time_s: float, period: float, length: float) -> bool:
+        """Whether it is the time of a fault of the first body that comes with a period."""
+        return number == 1 and _within(time_s - self._start_s, period, length)
 
 
 def _relabeled(body: BodyInFrame, number: int) -> BodyInFrame:

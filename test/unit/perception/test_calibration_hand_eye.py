@@ -5,10 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.boards import BoardView
+from knee_gap_perception.calibration.boards import CORNER_BIAS_PX, BoardView
 from knee_gap_perception.calibration.hand_eye import HandEye, HandEyeSettings, calibrate_hand_eye
 from knee_gap_perception.calibration.hand_eye_bundle import HandEyeBundle, HandEyeState, TrackedView
-from knee_gap_perception.calibration.intrinsics import IntrinsicsFit, design_effect, fit_intrinsics
+from knee_gap_perception.calibration.intrinsics import (
+    IntrinsicsFit,
+    board_pose,
+    design_effect,
+    fit_intrinsics,
+)
 from knee_gap_perception.calibration.lens_model import LensModel
 from knee_gap_perception.calibration.rigid import Array, angle_between, apply, from_vector, inverse, to_vector
 from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turned_lens
@@ -248,3 +253,26 @@ def test_a_small_turn_of_the_scope_cannot_give_its_axis() -> None:
     turns = np.concatenate([np.zeros(8), np.full(8, 0.15)])
     with pytest.raises(PerceptionError, match="turn the light post further"):
         calibrated(views(15, turns))
+
+
+def test_a_board_whose_origin_lies_behind_the_lens_has_a_pose() -> None:
+    """The corner of a board that is looked at slantwise from near need not be before the lens."""
+    T_lens_board = from_vector([0.5746, -0.3149, 0.5496, -0.00874, -0.022, -0.0004])
+    before = apply(T_lens_board, GRID)[:, 2] > 0.008
+    points = GRID[before]
+    view = BoardView(
+        0, np.flatnonzero(before), points, MODEL.project(apply(T_lens_board, points), LENS).pixels
+    )
+    assert board_pose(view, LENS, MODEL) == pytest.approx(T_lens_board, abs=1e-5)
+    with pytest.raises(PerceptionError, match="cannot be told"):
+        # Seen by a lens that looks the other way.
+        board_pose(view._replace(pixels=2 * LENS[2:4] - view.pixels), -LENS, MODEL)
+
+
+def test_what_corners_have_in_common_is_less_than_what_dots_have() -> None:
+    """The bias that no residual shows depends on what was found, and is in every covariance."""
+    tracked = views(3, np.zeros(20))
+    corners = [one._replace(board=one.board._replace(bias_px=CORNER_BIAS_PX)) for one in tracked]
+    by_dots, by_corners = calibrated(tracked), calibrated(corners)
+    assert (np.diag(by_dots.covariance) > np.diag(by_corners.covariance)).all()
+    assert by_dots.intrinsics.covariance[0, 0] > by_corners.intrinsics.covariance[0, 0]

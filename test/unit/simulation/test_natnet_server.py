@@ -14,7 +14,8 @@ from knee_gap_perception.poses import BodyPose, LensPose
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_simulation import natnet_server_packets as packets
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.natnet_server import NatNetServer, ServerSettings, main
+from knee_gap_simulation.natnet_server import NatNetServer, ServerSettings
+from knee_gap_simulation.natnet_server_command import main
 from knee_gap_simulation.natnet_server_packets import VERSIONS
 from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, Faults, TrackedScene
 

@@ -30,7 +30,7 @@ from knee_gap_perception.calibration.hand_eye_bundle import (
     TrackedView,
     tracker_sigma,
 )
-from knee_gap_perception.calibration.intrinsics import SYSTEMATIC_PX, Intrinsics, board_pose, systematic
+from knee_gap_perception.calibration.intrinsics import Intrinsics, bias_of, board_pose, systematic
 from knee_gap_perception.calibration.lens_model import LensModel
 from knee_gap_perception.calibration.rigid import (
     Array,
@@ -52,9 +52,12 @@ ROTATION_ERROR = np.radians(0.004)
 START_SCALE = 5.0
 OUTLYING_TIMES, OUTLYING_PX = 6.0, 2.0  # a view is left out beyond both, in medians and in pixels
 OUTLYING_VIEWS = 12
-SYSTEMATIC_DEPTHS = (
-    2.0  # a bias that grows over the picture moves the lens by this many times angle x distance
-)
+# What a bias of the points that is alike in all views does to the lens, in shares of the angle under which
+# the bias is seen at the border of the picture (x, y, z): turns, and shifts by angle x distance. Most of all
+# it looks like another distance.
+BIAS_TURNS, BIAS_SHIFTS = (0.5, 0.5, 0.25), (0.5, 0.5, 2.0)
+# What smoothing takes from a hand's tremor, as an error of the clock [s], and what the bias adds [s/px].
+ERROR_OF_SMOOTHING, TIME_BY_BIAS = 3e-5, 4e-4
 
 
 class SolverResult(NamedTuple):
@@ -303,7 +306,7 @@ def _result(
         axis=state.axis,
         axis_sigma=_axis_sigma(sigma, floor) if bundle.has_axis else None,
         time_offset=state.time_offset,
-        time_offset_sigma=float(sigma[-5 if bundle.has_axis else -1]) if bundle.timed else np.nan,
+        time_offset_sigma=_time_sigma(bundle, float(sigma[-5 if bundle.has_axis else -1])),
         rotation_error=float(bundle.pose_sigma[0] * np.sqrt(3)),
         translation_error=float(bundle.pose_sigma[3] * np.sqrt(3)),
         rms_px=float(np.sqrt(2 * squares.mean())),
@@ -317,9 +320,16 @@ def _systematic(bundle: HandEyeBundle, state: HandEyeState) -> Array:
     """Covariance (6, 6) of what no residual shows: a bias of the found points that is alike in all views."""
     poses = [board_pose(view.board, state.lens, bundle.model) for view in bundle.views]
     distance = float(np.median([np.linalg.norm(T_lens_board[:3, 3]) for T_lens_board in poses]))
-    angle = SYSTEMATIC_PX / float(state.lens[0])
-    shift = SYSTEMATIC_DEPTHS * angle * distance
-    return np.diag(np.repeat([angle**2, shift**2], 3))
+    angle = bias_of([view.board for view in bundle.views]) / float(state.lens[0])
+    return np.diag(np.square(np.concatenate([BIAS_TURNS, np.multiply(BIAS_SHIFTS, distance)]) * angle))
+
+
+def _time_sigma(bundle: HandEyeBundle, fitted: float) -> float:
+    """Standard error of the clock [s] from that of the fit and what no residual shows; NaN if not fitted."""
+    if not bundle.timed:
+        return np.nan
+    by_bias = TIME_BY_BIAS * bias_of([view.board for view in bundle.views])
+    return float(np.linalg.norm([fitted, ERROR_OF_SMOOTHING, by_bias]))
 
 
 def _axis_sigma(sigma: Array, floor: Array) -> tuple[float, float]:
@@ -353,7 +363,7 @@ def _refined_intrinsics(
     free = bundle.model.free
     lens = np.zeros((len(free), len(free)))
     lens[np.ix_(free, free)] = covariance[12 : 12 + free.sum(), 12 : 12 + free.sum()]
-    lens += systematic(len(free))
+    lens += systematic(len(free), bias_of([view.board for view in bundle.views]))
     fx, fy, cx, cy = (float(value) for value in state.lens[:4])
     k = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
     return replace(intrinsics, k=k, d=tuple(map(float, state.lens[4:])), covariance=lens)

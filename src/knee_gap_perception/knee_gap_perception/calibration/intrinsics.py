@@ -25,7 +25,6 @@ MIN_TILT = np.radians(
 MIN_COVERAGE = 0.25  # of the picture's height and width that the points must span
 OUTLIER_SIGMAS = 5.0
 OUTLIER_FLOOR_PX = 0.3
-SYSTEMATIC_PX = 0.05  # bias of corner detection, alike in all views: blur, perspective in the window, shading
 CORRELATION_RANGE = 8  # spacings of the points over which their errors may agree
 
 
@@ -125,9 +124,12 @@ def board_pose(view: BoardView, parameters: Array, model: LensModel) -> Array:
         found, rotation, translation = cv2.solvePnP(
             view.points, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
         )
-    if not found or rotation is None or translation is None or translation[2, 0] <= 0:
-        raise PerceptionError(f"the board's pose cannot be told from {len(view.ids)} points")
-    return from_vector(np.concatenate([rotation.ravel(), translation.ravel()]))
+    if found and rotation is not None and translation is not None:
+        T_lens_board = from_vector(np.concatenate([rotation.ravel(), translation.ravel()]))
+        # The points are before the lens; the board's origin, which need not be seen, may lie behind it.
+        if (apply(T_lens_board, view.points)[:, 2] > 0).all():
+            return T_lens_board
+    raise PerceptionError(f"the board's pose cannot be told from {len(view.ids)} points")
 
 
 def _check_views(usable: Sequence[BoardView], offered: int) -> None:
@@ -253,7 +255,7 @@ def _without_outliers(
         good = length <= limit
         dropped += int((~good).sum())
         if good.sum() >= MIN_POINTS:
-            kept.append(BoardView(view.stamp_ns, view.ids[good], view.points[good], view.pixels[good]))
+            kept.append(view._replace(ids=view.ids[good], points=view.points[good], pixels=view.pixels[good]))
             kept_poses.append(pose)
     return kept, np.array(kept_poses), dropped
 
@@ -276,7 +278,7 @@ def _result(
     variance = squares.sum() / freedom
     covariance = np.zeros((len(parameters), len(parameters)))
     covariance[np.ix_(model.free, model.free)] = effect * variance * np.linalg.inv(information)
-    covariance += systematic(len(parameters))
+    covariance += systematic(len(parameters), bias_of(views))
     fx, fy, cx, cy = (float(value) for value in parameters[:4])
     distortion = list(map(float, parameters[4:]))
     intrinsics = Intrinsics(
@@ -295,11 +297,16 @@ def _result(
     return IntrinsicsFit(intrinsics, tuple(views), poses, np.sqrt(squares / points), dropped)
 
 
-def systematic(parameter_count: int) -> Array:
+def bias_of(views: Sequence[BoardView]) -> float:
+    """The largest bias [px] of the points of views."""
+    return max(view.bias_px for view in views)
+
+
+def systematic(parameter_count: int, bias_px: float) -> Array:
     """Covariance (m, m) of the lens from what no residual shows: a bias of points, alike in all views."""
     sigma = np.zeros(parameter_count)
     # Half the field of view is about half a radian: a bias there moves the focal length by twice as much.
-    sigma[:4] = 2 * SYSTEMATIC_PX, 2 * SYSTEMATIC_PX, SYSTEMATIC_PX, SYSTEMATIC_PX
+    sigma[:4] = 2 * bias_px, 2 * bias_px, bias_px, bias_px
     return np.diag(sigma**2)
 
 
