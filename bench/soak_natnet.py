@@ -2,9 +2,10 @@
 
     tools/env python bench/soak_natnet.py --minutes 10 --rate 240
 
-The server runs in its own process, with lost frames, invalid bits, occlusions, swapped labels, jitter and
-restarts; its clock body tells the true time of each exposure, and the scene the true pose of the scope. Ends
-with 1 where a stamp was off by a millisecond or more, or a pose was called valid that was not the scope's.
+The server runs in its own process, with lost frames, invalid bits, occlusions, swapped labels, frozen poses,
+jumps, jitter and restarts; its clock body tells the true time of each exposure, and the scene the true pose
+of the scope. Ends with 1 where a stamp was off by a millisecond or more, or a pose was called valid that was
+not the scope's.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 from knee_gap_perception.optitrack.body_source import BodyFrame, choose_body
 from knee_gap_perception.optitrack.natnet_client import NatNetClient, NatNetParameters
 from knee_gap_perception.poses import LensPose
-from knee_gap_perception.tracking import ScopeTracker
+from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, TrackedScene
 
 NAMES = ("scope", "tibia", "clock")
@@ -33,6 +34,8 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
         "--invalid": 0.01,
         "--occlude-every": 7.0,
         "--swap-every": 11.0,
+        "--freeze-every": 13.0,
+        "--jump-every": 17.0,
         "--jitter-ms": 0.5,
         "--restart-every": 45.0,
         "--down-for": 4.0,
@@ -50,7 +53,8 @@ class Watch:
 
     def __init__(self) -> None:
         self.scene = TrackedScene(NAMES)
-        self.tracker = ScopeTracker()
+        # Judged is the body: where the lens sits on it does not matter.
+        self.tracker = ScopeTracker(TrackingParameters(body_to_shaft_translation=(0.0, 0.0, 0.0)))
         self.frames = 0
         self.stamp_errors: list[float] = []
         self.worst_pose = 0.0
@@ -85,8 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--multicast", action="store_true")
     parser.add_argument("--port", type=int, default=15410)
     arguments = parser.parse_args(argv)
-    server = subprocess.Popen(server_command(arguments), stdout=subprocess.DEVNULL)
     watch, end, told = Watch(), time.monotonic() + arguments.minutes * 60.0, time.monotonic()
+    server = subprocess.Popen(server_command(arguments), stdout=subprocess.DEVNULL)
     try:
         with NatNetClient(NatNetParameters(command_port=arguments.port)) as client:
             while time.monotonic() < end:

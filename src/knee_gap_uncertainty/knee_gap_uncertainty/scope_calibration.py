@@ -70,7 +70,7 @@ class CalibrationError:
         if not np.isfinite(fit.points).all() or views.lens_rotations is None:
             return fit
         shift = self._moved_points(fit, views)
-        moved = shift @ self._root(shift.shape[1])
+        moved = shift @ self.root(shift.shape[1])
         return widened(fit, moved @ moved.T)
 
     def bounds(self, first: PosedView, present: PosedView, factor: float) -> tuple[float, float]:
@@ -90,7 +90,7 @@ class CalibrationError:
         position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late)
         return factor * float(angle), factor * float(position)
 
-    def _root(self, count: int) -> Array:
+    def root(self, count: int) -> Array:
         """(count, count) whose product with its transpose is the covariance of all shared errors.
 
         They are shift, rotation and clock, and then those of the camera, which have a variance of 1.

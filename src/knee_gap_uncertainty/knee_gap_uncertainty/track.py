@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_uncertainty.calibration_fit import explained_by
 from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.depth_drift import with_depth_drift
 from knee_gap_uncertainty.errors import (
@@ -106,7 +107,7 @@ class Track:
         self._follow_direction(view)
         views = self._views_with(view.view)
         fitted, flaw = self._fitted(views)
-        finding = self._joint_motion.judge(views, fitted, self._passing)
+        finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
             return self._contradicted(blank, view, finding)
         self._passing = None if self._window.add(view.view) else view.view
@@ -130,6 +131,17 @@ class Track:
         if not len(self._window):
             return replace(present, common_share=share)
         return self._window.views(share).joined(present)
+
+    def _without_shared_error(
+        self, views: Views, fitted: MultiViewFit | None
+    ) -> tuple[Views, MultiViewFit | None, Views | None]:
+        """The views, their fit and the passing view, less what the calibration's error explains of them."""
+        shared = explained_by(self._calibration, views) if self._calibration is not None else None
+        if shared is None:
+            return views, fitted, self._passing
+        passing = None if self._passing is None else shared.taken_from(self._passing)
+        corrected = shared.taken_from(views)
+        return corrected, self._fitted(corrected)[0], passing
 
     def _fitted(self, views: Views) -> tuple[MultiViewFit | None, str]:
         """Fit over the views, or why there is none."""

@@ -1,0 +1,66 @@
+"""What a wrong calibration does to the views of a track is told from a joint that moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knee_gap_uncertainty.calibration_fit import explained_by
+from knee_gap_uncertainty.gap_estimate import GapStatus
+from knee_gap_uncertainty.multi_view import fit
+from knee_gap_uncertainty.scope_calibration import CalibrationError
+from knee_gap_uncertainty.simulated_scope import POINTS, SIGMA, Hand, stated, wrong_scope
+from knee_gap_uncertainty.views import Views
+
+LARGE = (2e-3, np.radians(1.5), 3e-3)
+
+
+def test_a_wrong_calibration_with_a_stated_error_is_no_motion() -> None:
+    gap = float(np.linalg.norm(POINTS[1] - POINTS[0]))
+    for seed in range(6):
+        told = wrong_scope(seed, *LARGE)
+        assert GapStatus.JOINT_MOVED not in {one.status for one in told}
+        valid = [one for one in told if one.status is GapStatus.VALID]
+        assert all(one.gap_min < gap < one.gap_max for one in valid)
+
+
+@pytest.mark.parametrize("scope", [(2e-5, np.radians(0.015), 4e-5), (3e-4, np.radians(0.2), 1e-3)])
+def test_a_joint_that_moves_is_still_found(scope: tuple[float, float, float]) -> None:
+    across = np.array([0.0, 0.002, 0.0])
+    for seed in range(4):
+        told = [one.status for one in wrong_scope(seed, *scope, moved=across)]
+        assert GapStatus.JOINT_MOVED in told[75:]
+        assert GapStatus.JOINT_MOVED not in told[:75]
+
+
+@pytest.mark.parametrize("axis", range(7))
+def test_without_noise_nothing_is_left_of_the_error(axis: int) -> None:
+    """The views less the error fit points at rest, which as they come they do not."""
+    size = np.array([2e-3] * 3 + [np.radians(2.0)] * 3 + [8e-3])
+    wrong = np.zeros(7)
+    wrong[axis] = size[axis]
+    views = Hand(np.random.default_rng(axis), wrong).views()
+    error = CalibrationError(np.diag(size[:6] ** 2), float(size[6]))
+    shared = explained_by(error, views)
+    assert shared is not None
+    before, after = residual(views), residual(shared.taken_from(views))
+    assert after < 0.1 * SIGMA
+    assert after < 0.35 * before or before < 0.1 * SIGMA
+
+
+def residual(views: Views) -> float:
+    """RMS angle [rad] by which the views miss the points that suit them best."""
+    points = fit(replace(views, common_share=0.0)).points
+    towards = points - views.lens_positions[:, None]
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    return float(np.sqrt(np.mean(np.sum((towards - views.bearings) ** 2, axis=-1))))
+
+
+def test_an_error_far_below_the_noise_is_left_alone() -> None:
+    views = Hand(np.random.default_rng(2), np.zeros(7)).views()
+    assert explained_by(CalibrationError(stated(2e-5, np.radians(0.01)), 3e-5), views) is None
+    assert explained_by(CalibrationError(stated(*LARGE[:2]), LARGE[2]), views) is not None
+    assert (
+        explained_by(CalibrationError(stated(*LARGE[:2]), LARGE[2]), replace(views, lens_rotations=None))
+        is None
+    )
