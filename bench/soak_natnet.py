@@ -2,10 +2,10 @@
 
     tools/env python bench/soak_natnet.py --minutes 10 --rate 240
 
-The server runs in its own process, with lost frames, invalid bits, occlusions, swapped labels, frozen poses,
-jumps, jitter and restarts; its clock body tells the true time of each exposure, and the scene the true pose
-of the scope. Ends with 1 where a stamp was off by a millisecond or more, or a pose was called valid that was
-not the scope's.
+The server runs in its own process, with lost frames, invalid bits, occlusions, swapped labels, jitter and
+restarts, with --jumps frozen poses and jumps as well; its clock body tells the true time of each exposure,
+and the scene the true pose of the scope. Ends with 1 where a stamp was off by a millisecond or more, or a
+pose was called valid that was not the scope's.
 """
 
 import argparse
@@ -34,8 +34,6 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
         "--invalid": 0.01,
         "--occlude-every": 7.0,
         "--swap-every": 11.0,
-        "--freeze-every": 13.0,
-        "--jump-every": 17.0,
         "--jitter-ms": 0.5,
         "--restart-every": 45.0,
         "--down-for": 4.0,
@@ -43,6 +41,8 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
     module = "knee_gap_simulation.natnet_server_command"
     command = [sys.executable, "-m", module, "--version", arguments.version, "--rate", str(arguments.rate)]
     command += ["--command-port", str(arguments.port), "--data-port", str(arguments.port + 1)]
+    if arguments.jumps:
+        faults |= {"--freeze-every": 13.0, "--jump-every": 17.0}
     if arguments.multicast:
         command += ["--multicast", "239.255.42.98"]
     return command + [str(part) for fault in faults.items() for part in fault]
@@ -86,6 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=240.0)
     parser.add_argument("--version", default="4.1")
+    parser.add_argument("--jumps", action="store_true", help="frozen poses and jumps as well")
     parser.add_argument("--multicast", action="store_true")
     parser.add_argument("--port", type=int, default=15410)
     arguments = parser.parse_args(argv)

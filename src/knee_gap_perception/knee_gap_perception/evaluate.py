@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
+from knee_gap_node.bag_paths import missing_bag
 from knee_gap_perception.calibration.bag_input import CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.camera import Camera, EquiangularCamera, camera_from_info
@@ -172,6 +173,8 @@ def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
         raise PerceptionError(f"--every must be at least 1, not {arguments.every}")
     if not is_bag(arguments.predicted):
         if arguments.marked is None:
+            if not arguments.predicted.is_dir():
+                raise PerceptionError(missing_bag(arguments.predicted))
             raise PerceptionError(
                 f"{arguments.predicted} is no bag, it has no metadata.yaml: "
                 "name the folder of marked masks as well"

@@ -143,7 +143,15 @@ def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
         setattr(
             message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
         )
-        setattr(message, f"camera_error_{index}", np.array(edges.camera_errors[index], float).ravel())
+        setattr(message, f"camera_error_{index}", _camera_error(edges.camera_errors[index]))
     message.pose_used = bool(edges.pose_used)
     message.angular_error = float(edges.angular_error)
     return message
+
+
+def _camera_error(errors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Displacements (3, k), at most nine, as the message holds them (27,); NaN where there are none."""
+    count = errors.shape[1]
+    padded = np.full((3, 9), 0.0 if count else np.nan)
+    padded[:, :count] = errors
+    return padded.ravel()

@@ -7,9 +7,9 @@ from math import degrees, isnan
 from pathlib import Path
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.highlevel import AnyReaderError
 
+from knee_gap_perception.calibration.bag_input import opened
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import body_pose_from_message
 from knee_gap_perception.optitrack.motive_csv import read_take
@@ -49,7 +49,7 @@ def read_bodies(path: Path, topic: str | None, body: str | None, up_axis: str) -
         name = take.body(body).name if body is not None else take.bodies[0].name
         return [pose for frame in take.frames(1) for pose in frame.bodies if pose.name == name]
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        with opened(path) as reader:
             poses = {item.topic for item in reader.connections if item.msgtype in POSE_TYPES}
             chosen = topic or next((name for name in sorted(poses) if name.endswith("scope_body/pose")), None)
             if chosen not in poses:
@@ -63,7 +63,7 @@ def read_bodies(path: Path, topic: str | None, body: str | None, up_axis: str) -
                 for item, _, data in reader.messages(connections)
             ]
     except (AnyReaderError, OSError) as error:
-        raise PerceptionError(f"{path}: no bag that can be read: {str(error).splitlines()[0]}") from None
+        raise PerceptionError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
 
 
 def table(precisions: Sequence[Precision]) -> list[str]:

@@ -18,6 +18,7 @@ from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from knee_gap_node.bag_paths import missing_bag
 from knee_gap_replay import qos as qos_profiles
 from knee_gap_replay.errors import BagError
 from knee_gap_replay.mcap_file import McapFile, in_time_order, mcap_files
@@ -238,16 +239,16 @@ class BagReader:
             yield BagMessage(entry.topic, full_name(entry.schema_name), entry.time_ns, entry.data)
 
     def _locate(self) -> list[Path]:
-        if not self.path.exists():
-            raise BagError(f"{self.path} does not exist")
-        if self.path.is_file():
+        if self.path.is_file() or not self.path.exists():
+            if flaw := missing_bag(self.path):
+                raise BagError(flaw)
             return [self.path]
         information = self._information()
         files = [self.path / Path(str(name)).name for name in information.get("relative_file_paths") or ()]
         self._missing += [f"{file.name} is missing" for file in files if not file.exists()]
         files = [file for file in files if file.exists()] or mcap_files(self.path)
         if not files:
-            raise BagError(f"{self.path} holds no MCAP file")
+            raise BagError(missing_bag(self.path) or f"{self.path} holds no file of its bag")
         self.metadata.update(information.get("custom_data") or {})
         return files
 

@@ -39,11 +39,9 @@ def edges_from_message(message: Any) -> EdgeObservation:
 
 
 def _camera_errors(message: Any) -> npt.NDArray[np.float64]:
-    """Errors (2, 3, k) of a knee_gap_msgs/GapEdges; NaN where their numbers do not fit together."""
-    first, second = (np.array(one, dtype=float) for one in (message.camera_error_0, message.camera_error_1))
-    if first.size != second.size or first.size % 3:
-        return np.full((2, 3, 1), np.nan)
-    return np.array([first.reshape(3, -1), second.reshape(3, -1)])
+    """Errors (2, 3, k) of the camera of a knee_gap_msgs/GapEdges; k is 0 where they are not known."""
+    errors = np.array([message.camera_error_0, message.camera_error_1], dtype=float).reshape(2, 3, 9)
+    return errors[:, :, :0] if np.isnan(errors).all() else errors
 
 
 def pose_from_message(message: Any) -> LensPose:

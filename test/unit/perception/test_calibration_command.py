@@ -87,7 +87,7 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["time_offset", "BAG", "--into", "OUT", "--pose-topic", "/nowhere"], "/knee_gap/scope_body/pose"),
         (["oblique", "BAG", "--into", "OUT", "--board", BOARD, "--end", "2"], "about a second"),
         (["pivot", "BAG", "--into", "OUT"], "calibrate intrinsics first"),
-        (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "no ROS 2 bag"),
+        (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
     ],
 )

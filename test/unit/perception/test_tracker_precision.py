@@ -181,7 +181,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["{0}/none"], "no bag that can be read"),
+            (["{0}/none"], "does not exist"),
             (
                 ["{0}/bag", "--topic", "/wrong"],
                 "no poses on /wrong; topics with poses: /knee_gap/scope_body/pose",

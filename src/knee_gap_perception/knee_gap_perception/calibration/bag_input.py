@@ -13,6 +13,7 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from knee_gap_node.bag_paths import missing_bag
 from knee_gap_perception.calibration.rigid import Array, rigid
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import image_from_compressed, image_from_message, stamp_ns
@@ -36,7 +37,7 @@ class CalibrationBag:
     def steps(self) -> dict[str, tuple[float, float]]:
         """Parts [s] that the step topic marks, by name; empty where nothing was marked."""
         marks: list[tuple[float, str]] = []
-        with _opened(self.path) as reader:
+        with opened(self.path) as reader:
             connections = [c for c in reader.connections if c.topic == STEP_TOPIC]
             for connection, time_ns, data in reader.messages(connections) if connections else ():
                 name = str(getattr(reader.deserialize(data, connection.msgtype), "data", ""))
@@ -67,7 +68,7 @@ class CalibrationBag:
 
     def has(self, topic: str) -> bool:
         """Whether the bag has messages on a topic."""
-        with _opened(self.path) as reader:
+        with opened(self.path) as reader:
             return any(c.topic == topic and c.msgcount for c in reader.connections)
 
     def camera_info(self, topic: str) -> Any | None:
@@ -96,7 +97,7 @@ class CalibrationBag:
         return np.array(stamps, dtype=np.int64), rigid(Rotation.from_quat(quaternions).as_matrix(), positions)
 
     def _messages(self, topic: str, msgtypes: tuple[str, ...]) -> Iterator[tuple[int, Any, str]]:
-        with _opened(self.path) as reader:
+        with opened(self.path) as reader:
             connections = _connections(reader, topic, msgtypes, self.path)
             start, stop = reader.start_time + int(self.begin * 1e9), None
             if np.isfinite(self.end):
@@ -106,8 +107,12 @@ class CalibrationBag:
                 yield stamp_ns(message.header), message, connection.msgtype
 
 
-def _opened(path: Path) -> AnyReader:
+def opened(path: Path) -> AnyReader:
+    """Reader of a bag, named by its folder or a file in it. Raises PerceptionError where it is none."""
     folder = path.parent if path.suffix == ".mcap" else path
+    # Other storages than MCAP are read as well, where there is one.
+    if not any(folder.glob("*.db3")) and (flaw := missing_bag(path)):
+        raise PerceptionError(flaw)
     if not (folder / "metadata.yaml").is_file():
         raise PerceptionError(f"{path} is no ROS 2 bag: there is no metadata.yaml")
     try:
