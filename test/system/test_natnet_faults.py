@@ -76,10 +76,10 @@ class Judged:
 @pytest.mark.parametrize(
     ("fault", "reason", "words"),
     [
-        (["--freeze-every", "3", "--freeze-for", "0.8"], "frozen", "the driver is frozen"),
-        (["--swap-every", "3", "--swap-for", "0.8"], "swapped", "calls 'tibia' by the name of the body"),
-        (["--jump-every", "3", "--jump-for", "0.8"], "jump", "a jump"),
-        (["--occlude-every", "3", "--occlude-for", "0.8"], "not_tracked", "does not see the body"),
+        (["--freeze-every", "3.3", "--freeze-for", "0.8"], "frozen", "the driver is frozen"),
+        (["--swap-every", "3.3", "--swap-for", "0.8"], "swapped", "calls 'tibia' by the name of the body"),
+        (["--jump-every", "3.3", "--jump-for", "0.8"], "jump", "a jump"),
+        (["--occlude-every", "3.3", "--occlude-for", "0.8"], "not_tracked", "does not see the body"),
     ],
     ids=["frozen", "swapped", "jump", "occluded"],
 )

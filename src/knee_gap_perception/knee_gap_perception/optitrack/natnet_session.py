@@ -153,7 +153,7 @@ class NatNetSession:
         values: dict[str, object] = dict(sorted(self.counts.items()))
         info = self.info
         if info is None:
-            waited = (now_ns - (self._started_ns or now_ns)) / NANOSECONDS
+            waited = (now_ns - max(self._started_ns or now_ns, self._heard_ns)) / NANOSECONDS
             return SourceStatus(False, no_answer(self.server, waited, self._fault), values)
         name = f"{info.application} {info.application_version}, NatNet {info.natnet_version}"
         values["server"] = f"{name}, at {self.server}"
