@@ -122,7 +122,7 @@ def bend_of_gap(
             place = straight.copy()
             if not (_is_seen(straight) and _fit_again(turned, used, inverse, place, again)):
                 return Bend(0.0, 0.0, 1.0, False)
-            bend += (_gap(measured.frames, place) - _gap(measured.frames, straight)) / NODE**2
+            bend += (gap_of(measured.frames, place) - gap_of(measured.frames, straight)) / NODE**2
         mean += 0.5 * bend
         variance += 0.5 * bend * bend
         if k == 0:
@@ -150,7 +150,7 @@ def _directions(steepest: Array, steepness: float) -> Array:
 
 
 @compiled
-def _gap(frames: Array, unknowns: Array) -> float:
+def gap_of(frames: Array, unknowns: Array) -> float:
     """Distance of the two points [m]; inverse depths must be above 0."""
     squared = 0.0
     for k in range(3):

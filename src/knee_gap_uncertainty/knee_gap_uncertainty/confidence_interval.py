@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import norm
 
-from knee_gap_uncertainty.common_offset import Bend
+from knee_gap_uncertainty.common_offset import Bend, gap_of
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.curved_test import radius_at
 from knee_gap_uncertainty.distance_extremes import largest_distance, smallest_distance
@@ -76,9 +76,13 @@ def interval_ends(
     """
     lower, upper = _ends_of_ellipsoid(frames, unknowns, covariance, radius * bend.widening)
     move = bend.mean + (radius * radius - 1.0) * bend.skew
-    # The ellipsoid that holds two points at one place says nothing of how far they are apart at least.
-    lower = max(lower + move, 0.0) if lower > 0.0 else 0.0
-    return lower, max(upper + move, lower)
+    if move == 0.0 or not (unknowns[0, 2] > 0.0 and unknowns[1, 2] > 0.0):
+        return lower, upper
+    # The ends may not pass the gap itself. An ellipsoid that holds both points at one place says nothing of how
+    # far they are apart at least.
+    gap = gap_of(frames, unknowns)
+    lower = min(max(lower + move, 0.0), gap) if lower > 0.0 else 0.0
+    return lower, max(upper + move, gap)
 
 
 @compiled
