@@ -78,8 +78,8 @@ def interval_ends(
     move = bend.mean + (radius * radius - 1.0) * bend.skew
     if move == 0.0 or not (unknowns[0, 2] > 0.0 and unknowns[1, 2] > 0.0):
         return lower, upper
-    # The ends may not pass the gap itself. An ellipsoid that holds both points at one place says nothing of how
-    # far they are apart at least.
+    # The ends may not pass the gap. An ellipsoid that holds both points at one place says nothing of how far
+    # they are apart at least.
     gap = gap_of(frames, unknowns)
     lower = min(max(lower + move, 0.0), gap) if lower > 0.0 else 0.0
     return lower, max(upper + move, gap)
