@@ -13,9 +13,9 @@ from knee_gap_perception.parameters import check_parameters
 from knee_gap_perception.poses import BodyPose
 from knee_gap_perception.swapped_bodies import SwappedBodies
 
-# A body that jumped away is taken back within what the fastest motion reaches in this time [s], however long
-# it was gone: otherwise any second jump would count as its return.
-RETURN_TIME = 0.1
+# A body that jumped away, or was not seen, is taken back within what the fastest motion reaches in this time
+# [s], however long it was gone: otherwise any second jump, or any that nobody saw, would count as its return.
+RETURN_TIME = 0.05
 
 # Stamps jitter by less than this share of a period: a single lost frame is a gap of two, not of more.
 JITTER_PERIODS = 0.25
@@ -205,6 +205,8 @@ class PoseValidity:
         self._swapped = SwappedBodies()
         self._swapped.update((body, *others))
         self._swap_stamp_ns = None
+        # The labels are believed from here on: the body begins where its label is.
+        self._last = self._before_jump = None
         return None
 
     def _motion_fault(self, body: BodyPose, swapped_with: str | None) -> tuple[RefusalReason, str] | None:
@@ -237,15 +239,15 @@ class PoseValidity:
         if continues:
             if held < self.parameters.jump_hold:
                 return RefusalReason.JUMP, f"the body jumped {held:.3f} s ago and has not come back"
-        elif self._reach(origin, body, longest=RETURN_TIME) > 1.0:
+        elif self._reach(origin, body) > 1.0:
             self._jump_stamp_ns = body.stamp_ns
             return RefusalReason.JUMP, f"the body jumped again: it {_motion(last, body)}"
         self._before_jump = None
         return None
 
-    def _reach(self, start: BodyPose, end: BodyPose, longest: float = inf) -> float:
+    def _reach(self, start: BodyPose, end: BodyPose) -> float:
         """How far `end` is from `start`, as a share of what the fastest motion reaches; above 1 is a jump."""
-        elapsed = min(abs(end.stamp_ns - start.stamp_ns) / 1e9, longest)
+        elapsed = min(abs(end.stamp_ns - start.stamp_ns) / 1e9, RETURN_TIME)
         # Stamps that jitter must not turn a short interval into a high speed.
         if isfinite(self.period):
             elapsed = max(elapsed, self.period)

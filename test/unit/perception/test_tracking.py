@@ -304,8 +304,9 @@ class TestSwappedBodies:
         assert not any(accepted[100:200])
         assert all(accepted[:100] + accepted[201:])
 
-    def test_a_scope_that_moved_beside_the_leg_unseen_is_no_leg(self):
-        tracker, found = ScopeTracker(AT_BODY), []
+    def test_a_scope_that_moved_far_unseen_is_held_like_one_that_jumped_and_is_no_leg(self):
+        """Nothing tells an unseen motion from an unseen jump: neither is believed before the hold is over."""
+        tracker, found = ScopeTracker(AT_BODY, validity=ValidityParameters(jump_hold=1.0)), []
         for i in range(600):
             leg = replace(
                 hand_motion(0, name="leg", centre=(0.1, 0.0, 0.0)), stamp_ns=hand_motion(i).stamp_ns
@@ -313,7 +314,23 @@ class TestSwappedBodies:
             scope = hand_motion(i) if i < 100 else moved(hand_motion(i), [0.08, 0.0, 0.0])
             scope = replace(scope, tracking_valid=not 100 <= i < 400)
             found.append(tracker.update(scope, [leg]))
-        assert all(isinstance(result, LensPose) for result in found[401:])
+        assert {r.reason for r in found[400:520]} == {RefusalReason.JUMP}
+        assert all(isinstance(result, LensPose) for result in found[521:])
+
+    def test_a_scope_that_moved_a_little_unseen_is_taken_at_once(self):
+        tracker, found = ScopeTracker(AT_BODY), []
+        for i in range(300):
+            scope = hand_motion(i) if i < 100 else moved(hand_motion(i), [0.01, 0.0, 0.0])
+            found.append(tracker.update(replace(scope, tracking_valid=not 100 <= i < 200)))
+        assert all(isinstance(result, LensPose) for result in found[201:])
+
+    def test_a_jump_behind_an_occlusion_is_no_motion(self):
+        tracker, found = ScopeTracker(AT_BODY), []
+        for i in range(300):
+            scope = moved(hand_motion(i), [0.06, 0.0, 0.02]) if 150 <= i < 250 else hand_motion(i)
+            found.append(tracker.update(replace(scope, tracking_valid=not 100 <= i < 160)))
+        assert not any(isinstance(result, LensPose) for result in found[160:250])
+        assert all(isinstance(result, LensPose) for result in found[251:])
 
     def test_labels_swapped_in_a_drop_out_are_seen(self):
         # 60 frames are half a second: at 1 m/s either place could have been reached.
