@@ -4,12 +4,12 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy")
 
+from calibrated import SEED, calibrated_scope, messages, process
 from diagnostic_msgs.msg import DiagnosticArray
 from live import Client
 
@@ -17,15 +17,11 @@ from knee_gap_bringup.comparison import compare
 from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
-from knee_gap_perception.calibration.command import main as calibrate
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
 from knee_gap_simulation.make_bag import Recording, make_bag
 from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE
 
 DOMAIN = 58
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-SEED = 61
 UNKNOWN, VALID = GapEstimate.STATUS_UNKNOWN, GapEstimate.STATUS_VALID
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
@@ -35,13 +31,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `calibrate` writes from a small bag whose images are stamped 12 ms late."""
     folder = tmp_path_factory.mktemp("calibration")
-    make_calibration_bag(
-        folder / "board", CalibrationRecording(seed=SEED, fps=5, board_s=8, oblique_s=0, pivot_s=0)
-    )
-    for step in ("intrinsics", "hand_eye"):
-        into = ["--board", "charuco:12x9:3:2", "--into", str(folder / "scope.yaml"), "--views", "16"]
-        assert calibrate([step, str(folder / "board"), *into]) == 0
-    return folder / "scope.yaml"
+    return calibrated_scope(folder, "hand_eye", oblique_s=0, views=16)
 
 
 @pytest.fixture(scope="module")
@@ -72,16 +62,6 @@ def parameters(folder: Path, segmentation: Path | None, tracking: Path | None, *
     path = folder / "parameters.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
-
-
-def process(rims: Path, out: Path, file: Path) -> "subprocess.CompletedProcess[str]":
-    command = [executable("knee_gap_replay", "process"), str(rims), str(out), "--params-file", str(file)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def messages(bag: Path, topic: str) -> list[Any]:
-    with BagReader(bag) as reader:
-        return [reader.deserialize(entry) for entry in reader.messages([topic])]
 
 
 def test_a_gap_is_measured_with_the_file(calibration: Path, rims: Path, tmp_path: Path) -> None:

@@ -1,14 +1,13 @@
 """An oblique scope that is turned in its camera head while it measures: its notch tells by how much."""
 
-import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
+from calibrated import SEED, calibrated_scope, messages, process
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from live import Client
@@ -17,15 +16,11 @@ from knee_gap_bringup.comparison import compare
 from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEstimate, ScopeNotch
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.calibration.command import main as calibrate
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
 from knee_gap_simulation.make_bag import Recording, make_bag
 from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE
 
 DOMAIN = 63
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-SEED = 61
 TURNED = Recording(
     seed=32, duration_s=3.5, fps=30.0, scope_of=SEED, video_delay=0.012, turn=float(np.radians(-25.0))
 )
@@ -38,13 +33,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `calibrate oblique` writes from a bag in which the light post is turned as well."""
     folder = tmp_path_factory.mktemp("calibration")
-    make_calibration_bag(
-        folder / "board", CalibrationRecording(seed=SEED, fps=5, board_s=8, oblique_s=8, pivot_s=0)
-    )
-    for step in ("intrinsics", "oblique"):
-        into = ["--board", "charuco:12x9:3:2", "--into", str(folder / "scope.yaml"), "--views", "24"]
-        assert calibrate([step, str(folder / "board"), *into]) == 0
-    return folder / "scope.yaml"
+    return calibrated_scope(folder, "oblique", oblique_s=8, views=24)
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +52,6 @@ def parameters(folder: Path, calibration: Path, *by_notch: bool) -> Path:
     path = folder / "parameters.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
-
-
-def process(bag: Path, out: Path, file: Path) -> "subprocess.CompletedProcess[str]":
-    command = [executable("knee_gap_replay", "process"), str(bag), str(out), "--params-file", str(file)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def messages(bag: Path, topic: str) -> list[Any]:
-    with BagReader(bag) as reader:
-        return [reader.deserialize(entry) for entry in reader.messages([topic])]
 
 
 def test_the_gap_is_right_while_the_scope_turns(calibration: Path, turned: Path, tmp_path: Path) -> None:
