@@ -3,6 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_uncertainty.common_offset import gap_of
 from knee_gap_uncertainty.compiled import compiled
 from knee_gap_uncertainty.confidence_interval import interval_ends
 from knee_gap_uncertainty.multi_view import fit_arrays
@@ -57,16 +58,7 @@ def fit_all(
         ends = interval_ends(fitted.frames, fitted.unknowns, fitted.covariance, radius, fitted.bend)
         result[1, run], result[2, run], result[3, run] = ends[0], ends[1], np.inf
         if fitted.unknowns[0, 2] > 0.0 and fitted.unknowns[1, 2] > 0.0:
-            squared = 0.0
-            for k in range(3):
-                apart = 0.0
-                for n in range(2):
-                    direction = fitted.frames[n, 0, k]
-                    for axis in range(2):
-                        direction += fitted.unknowns[n, axis] * fitted.frames[n, 1 + axis, k]
-                    apart += (2 * n - 1) * direction / fitted.unknowns[n, 2]
-                squared += apart * apart
-            result[0, run] = np.sqrt(squared)
+            result[0, run] = gap_of(fitted.frames, fitted.unknowns)
             result[3, run] = max(
                 np.sqrt(fitted.covariance[2, 2]) / fitted.unknowns[0, 2],
                 np.sqrt(fitted.covariance[5, 5]) / fitted.unknowns[1, 2],
