@@ -11,16 +11,17 @@ import numpy.typing as npt
 from knee_gap_perception.calibration.rigid import Array
 from knee_gap_perception.field_of_view import FieldOfView, brightness
 
-STEPS = 720  # around the border: half a degree, four pixels of a field of 450 px
+STEPS = 480  # around the border: three quarters of a degree, six pixels of a field of 450 px
 STEP = 2.0 * np.pi / STEPS
 INNER, OUTER = 0.80, 1.08  # band that is looked at, in radii of the field
-SAMPLES = 56  # across the band
+SURROUND = 1.04  # from here on outwards a direction shows what lies outside the field
 TISSUE = 0.88  # up to here from inside a direction shows what lies in the picture, never the notch
+ACROSS = 0.005  # between two samples where the border may be; twice that beyond, where nothing is measured
 LEVEL = (
     0.18  # of the way from black to the brightness inside, at which the picture begins: the stop is black,
 )
 LEAST_LEVEL = 10.0  # [grey levels] and what is dark in the picture is not
-SMOOTH = 41  # directions (20 degrees) over which the brightness inside is levelled
+SMOOTH = 27  # directions (20 degrees) over which the brightness inside is levelled
 DARK = 22.0  # [grey levels] above black, below which a direction shows no tissue: the gap, or nothing
 DARK_SAMPLES = 1  # of a direction that is lit all the way
 CIRCLE_PASSES = 3
@@ -28,8 +29,15 @@ OFF_CIRCLE = 0.012  # of the radius, beyond which a direction is no part of the 
 FEWEST_ON_CIRCLE = 0.35  # of all directions
 
 _ANGLES = np.arange(STEPS) * STEP
-_RADII = np.linspace(OUTER, INNER, SAMPLES)
-BEYOND, WITHIN = int((_RADII > 1.04).sum()), int((_RADII > TISSUE).sum())
+_RADII = np.concatenate(
+    [
+        np.arange(OUTER, SURROUND + ACROSS, -2 * ACROSS),
+        np.arange(SURROUND, TISSUE, -ACROSS),
+        np.arange(TISSUE, INNER - ACROSS, -2 * ACROSS),
+    ]
+)
+SAMPLES = len(_RADII)
+BEYOND, WITHIN = int((_RADII > SURROUND + ACROSS / 2).sum()), int((_RADII > TISSUE + ACROSS / 2).sum())
 _DESIGN = np.stack([np.ones(STEPS), np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
@@ -129,7 +137,15 @@ def _about_its_circle(
     # Seen from the circle's own centre the directions turn a little.
     x, y = circle[1] / circle[0], circle[2] / circle[0]
     depth = (_DESIGN @ circle - reach) / circle[0]
-    turned = _ANGLES - (y * np.cos(_ANGLES) - x * np.sin(_ANGLES))
-    depth = np.interp(_ANGLES, turned, depth, period=2.0 * np.pi)
+    back = y * _DESIGN[:, 1] - x * _DESIGN[:, 2]
+    depth = _moved(depth, back / STEP)
     moved = (centre[0] + radius * float(circle[1]), centre[1] + radius * float(circle[2]))
     return Border(np.asarray(depth), solid, moved, radius * float(circle[0]))
+
+
+def _moved(depth: Array, steps: Array) -> Array:
+    """Values (STEPS,) about another centre, whose directions see what is `steps` further on from here."""
+    place = np.arange(STEPS) + steps
+    whole = np.floor(place)
+    share, index = place - whole, whole.astype(np.intp) % STEPS
+    return np.asarray((1.0 - share) * depth[index] + share * depth[(index + 1) % STEPS])
