@@ -67,6 +67,12 @@ def test_the_gap_is_right_while_the_scope_turns(calibration: Path, turned: Path,
     poses = messages(tmp_path / "out", "/knee_gap/scope_pose")
     # A pose at each image whose notch was seen, and at no other time.
     assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in poses} == set(seen)
+    turns = {
+        (t.header.stamp.sec, t.header.stamp.nanosec): t.turn
+        for t in messages(tmp_path / "out", "/knee_gap/scope_turn")
+    }
+    assert set(turns) == set(seen)
+    assert np.ptp([np.angle(np.exp(1j * (turns[stamp] - seen[stamp]))) for stamp in seen]) < 1e-9
 
 
 def test_a_turn_that_is_not_told_of_makes_it_wrong(calibration: Path, turned: Path, tmp_path: Path) -> None:

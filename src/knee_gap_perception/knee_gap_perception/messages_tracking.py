@@ -65,6 +65,14 @@ def fill_scope_calibration(message: Any, node: str, calibration: Calibration | N
     return message
 
 
+def fill_scope_turn(message: Any, lens: LensPose) -> Any:
+    """Set every field of a knee_gap_msgs/ScopeTurn; returns the message."""
+    _fill_header(message.header, lens)
+    message.header.frame_id = lens.child_frame_id
+    message.turn = float(lens.scope_turn)
+    return message
+
+
 def fill_scope_notch(message: Any, sight: NotchSight, frame_id: str) -> Any:
     """Set every field of a knee_gap_msgs/ScopeNotch; returns the message."""
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(sight.stamp_ns, 1_000_000_000)

@@ -36,6 +36,7 @@ class LensPose:
     `position` (3,) [m] and `quaternion_xyzw` (4,) map coordinates of `child_frame_id` (z along the view, x to
     the right, y down) to `frame_id`. `covariance` (6, 6) is that of position [m^2] and of a small rotation
     [rad^2] about the fixed axes of `frame_id`, in the order x, y, z, rotation about x, y, z (REP-103).
+    `scope_turn` [rad] is how far the scope is turned in its camera head since its calibration.
     """
 
     stamp_ns: int
@@ -44,6 +45,7 @@ class LensPose:
     position: Array
     quaternion_xyzw: Array
     covariance: Array
+    scope_turn: float = 0.0
 
     def matrix(self) -> Array:
         """Return the pose as `T_world_lens` (4, 4), which maps lens coordinates to `frame_id`."""

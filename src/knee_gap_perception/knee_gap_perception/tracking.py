@@ -163,6 +163,11 @@ class ScopeTracker:
         """Whether the notch in each image tells how far the scope is turned."""
         return self._by_notch is not None
 
+    @property
+    def follows_turn(self) -> bool:
+        """Whether it is followed how far the scope is turned, by the notch or a second body."""
+        return self.by_notch or bool(self.parameters.scope_turn_body)
+
     def take(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> list[LensPose | Refusal]:
         """Take a frame of the tracker, as `update`; return all that follows from it."""
         result = self.update(body, others)
@@ -275,6 +280,7 @@ class ScopeTracker:
             position=body.position + lever,
             quaternion_xyzw=quaternion,
             covariance=covariance,
+            scope_turn=turn,
         )
         if tracked.reference is None:
             return lens

@@ -7,12 +7,17 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
-from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch
+from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages_tracking import fill_lens_pose, fill_scope_calibration, notch_from_message
+from knee_gap_perception.messages_tracking import (
+    fill_lens_pose,
+    fill_scope_calibration,
+    fill_scope_turn,
+    notch_from_message,
+)
 from knee_gap_perception.optitrack.natnet_client import NatNetParameters
 from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
@@ -46,6 +51,8 @@ class TrackingNode(BaseNode):
             self._feed = ScopeFeed(source, natnet, other_bodies=others, ros_now=self.now_ns)
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
+        if self._tracker.follows_turn:
+            self._scope_turn = self.create_publisher(ScopeTurn, "scope_turn", RESULT_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         told = fill_scope_calibration(ScopeCalibration(), "tracking_node", self._tracker.calibration)
         self._calibration.publish(told)
@@ -118,6 +125,8 @@ class TrackingNode(BaseNode):
         """Publish poses of the lens, and log why there are none."""
         for lens in lenses:
             if isinstance(lens, LensPose):
+                if self._tracker.follows_turn:
+                    self._scope_turn.publish(fill_scope_turn(ScopeTurn(), lens))
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
                 self._refused, self._why_refused = self._refused + 1, lens.detail
@@ -151,7 +160,7 @@ class TrackingNode(BaseNode):
             **source.values,
             **refused,
         }
-        if self._tracker.parameters.scope_turn_body or self._tracker.by_notch:
+        if self._tracker.follows_turn:
             counts["turn of the scope [rad]"] = self._tracker.turn
         return source.ok and accepted > 0, words, counts
 

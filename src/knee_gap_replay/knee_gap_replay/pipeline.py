@@ -19,6 +19,7 @@ from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
     fill_scope_calibration,
     fill_scope_notch,
+    fill_scope_turn,
     notch_from_message,
 )
 from knee_gap_perception.notch_follower import NotchSight
@@ -155,6 +156,11 @@ class GapPipeline:
                 **self.outputs,
                 self._topic("scope_notch"): ("knee_gap_msgs/msg/ScopeNotch", "reliable"),
             }
+        if tracker.follows_turn:
+            self.outputs = {
+                **self.outputs,
+                self._topic("scope_turn"): ("knee_gap_msgs/msg/ScopeTurn", "reliable"),
+            }
         if with_mask:
             self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
@@ -213,6 +219,10 @@ class GapPipeline:
         for lens in lenses:
             if not isinstance(lens, LensPose):
                 continue
+            if self._tracker.follows_turn:
+                turn = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), lens)
+                yield Output(self._topic("scope_turn"), turn, lens.stamp_ns)
+                self._estimator.add_turn(messages.turn_from_message(turn))
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
             estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)

@@ -44,7 +44,7 @@ def typestore() -> Typestore:
     Raises BagError where the definitions of knee_gap_msgs are not found.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name in ("GapEdges", "GapEstimate", "MotionAdvice", "ScopeCalibration", "ScopeNotch"):
+    for name in ("GapEdges", "GapEstimate", "MotionAdvice", "ScopeCalibration", "ScopeNotch", "ScopeTurn"):
         _register(store, f"knee_gap_msgs/msg/{name}")
     return store
 

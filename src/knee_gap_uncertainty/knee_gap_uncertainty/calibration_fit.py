@@ -35,21 +35,29 @@ class SharedError(NamedTuple):
     motion: Array
 
     def taken_from(self, views: Views) -> Views:
-        """The views as they would be without it."""
+        """The views as they would be without it.
+
+        Taking a clock's error from a lens puts the errors of the two poses that tell its velocity in.
+        """
         assert views.lens_rotations is not None
         motions = _motions(views)
-        shift = (views.lens_rotations - self.rotation) @ self.parts[:3]
+        rotations = views.calibrated_rotations
+        shift = (rotations - self.rotation) @ self.parts[:3]
         shift += (motions[:, :3] - self.motion[:3]) * self.parts[6]
-        turn = views.lens_rotations @ self.parts[3:6] + motions[:, 3:] * self.parts[6]
+        turn = rotations @ self.parts[3:6] + motions[:, 3:] * self.parts[6]
         back = Rotation.from_rotvec(-turn).as_matrix()
         bearings = views.bearings
         if views.camera_errors is not None:
             bearings = bearings - views.camera_errors @ self.parts[7:]
         bearings = np.einsum("nij,nkj->nki", back, bearings)
+        times = np.full(len(views), np.inf) if views.motion_times is None else views.motion_times
+        larger = 1.0 + 2.0 * (self.parts[6] / times[:, None, None]) ** 2
         return replace(
             views,
             lens_positions=views.lens_positions - shift,
             bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True),
+            lens_covariances=larger * views.lens_covariances,
+            rotation_covariances=larger * views.rotation_covariances,
             lens_rotations=back @ views.lens_rotations,
         )
 
@@ -62,7 +70,7 @@ def explained_by(error: CalibrationError, views: Views) -> SharedError | None:
     if len(views) < 2 or views.lens_rotations is None:
         return None
     none = np.zeros(7 + (0 if views.camera_errors is None else views.camera_errors.shape[-1]))
-    shared = SharedError(none, views.lens_rotations[-1], _motions(views)[-1])
+    shared = SharedError(none, views.calibrated_rotations[-1], _motions(views)[-1])
     root = error.root(len(none))
     points = views.lens_positions[0] + EXPECTED_DEPTH * views.bearings[0]
     if _is_negligible(views, shared, root, points):
@@ -107,12 +115,12 @@ def _step(views: Views, shared: SharedError, root: Array, points: Array, start: 
 
 def _aside(views: Views, shared: SharedError, n: int, bearing: Array, length: Array) -> Array:
     """(N, 3, 7 + k): where the end of a ray of a length [m] goes with each part of the error."""
-    assert views.lens_rotations is not None
+    rotations = views.calibrated_rotations
     motions = _motions(views)
     aside = np.zeros((len(views), 3, len(shared.parts)))
-    aside[:, :, :3] = views.lens_rotations - shared.rotation
+    aside[:, :, :3] = rotations - shared.rotation
     aside[:, :, 3:6] = length[:, None, None] * np.cross(
-        np.swapaxes(views.lens_rotations, 1, 2), bearing[:, None, :]
+        np.swapaxes(rotations, 1, 2), bearing[:, None, :]
     ).swapaxes(1, 2)
     turned = np.cross(motions[:, 3:], bearing) * length[:, None]
     aside[:, :, 6] = motions[:, :3] - shared.motion[:3] + turned

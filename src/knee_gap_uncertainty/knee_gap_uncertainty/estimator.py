@@ -16,6 +16,7 @@ from knee_gap_uncertainty.leg_body import LegBody
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
+from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns
 from knee_gap_uncertainty.track import Track
 
 NANOSECONDS = 1_000_000_000
@@ -55,6 +56,7 @@ class GapEstimator:
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
+        self._turns = ScopeTurns()
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
         self._leg = LegBody(self.parameters.max_pose_age) if self.parameters.leg_motion > 0.0 else None
@@ -85,6 +87,10 @@ class GapEstimator:
             self._frame_id = pose.frame_id
             self._pose_delays_ns.append(arrival_ns - queued_ns - pose.stamp_ns)
         return self._resolve(arrival_ns)
+
+    def add_turn(self, told: ScopeTurn) -> None:
+        """Take how far the scope is turned in its camera head, before the pose of the same stamp."""
+        self._turns.add(told)
 
     def add_leg_pose(self, pose: LensPose) -> None:
         """Take a pose of the leg body; it is without effect where `leg_motion` is 0."""
@@ -207,7 +213,8 @@ class GapEstimator:
         if self._track is None or begins:
             self._leg_at_first = self._leg.pose if self._leg is not None else None
             self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
-        estimate = self._track.add(edges, pose)
+        turned = replace(pose, scope_turn=self._turns.at(edges.stamp_ns))
+        estimate = self._track.add(edges, turned)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))
 

@@ -9,6 +9,7 @@ from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import ScopeCalibration
+from knee_gap_uncertainty.scope_turns import ScopeTurn
 
 VALID_EDGES = 1
 TARGETS = {"snr": 0, "width": 1}
@@ -76,6 +77,11 @@ def calibration_from_message(message: Any) -> ScopeCalibration:
         lens_covariance=np.array(message.lens_covariance, dtype=float).reshape(6, 6),
         time_offset_error=float(message.time_offset_error),
     )
+
+
+def turn_from_message(message: Any) -> ScopeTurn:
+    """What a knee_gap_msgs/ScopeTurn says."""
+    return ScopeTurn(stamp_ns(message.header), float(message.turn))
 
 
 def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:

@@ -15,6 +15,9 @@ from knee_gap_uncertainty.errors import BadInputError
 Array = npt.NDArray[np.float64]
 
 
+# Over which the velocity is taken [ns]. The tracker's noise on it falls with this time, but the older it is,
+# the more a hand's has changed: 0.0367 mm over 17 ms are 3 mm/s, as are 0.5 m/s^2 in 6 ms.
+MOTION_TIME_NS = 20_000_000
 # A tracker that measures does not give the same numbers to the last bit so often in a row.
 FROZEN_REPEATS = 10
 
@@ -25,7 +28,8 @@ class LensPose:
 
     `position` (3,) [m] and `quaternion_xyzw` (4,) map lens coordinates to `frame_id`; `covariance` (6, 6) is
     in the order x, y, z [m^2], rotation about the fixed axes x, y, z of `frame_id` [rad^2] (REP-103).
-    `motion` (6,) is the velocity [m/s] and the turning about the same axes [rad/s], NaN where not known.
+    `motion` (6,) is the velocity [m/s] and the turning about the same axes [rad/s], NaN where not known, as
+    measured over `motion_time` [s]. `scope_turn` [rad] is how far the scope was turned in its camera head.
     """
 
     stamp_ns: int
@@ -34,6 +38,8 @@ class LensPose:
     quaternion_xyzw: Array
     covariance: Array
     motion: Array = field(default_factory=lambda: np.full(6, np.nan))
+    motion_time: float = np.inf
+    scope_turn: float = 0.0
 
 
 class PoseRefusal(StrEnum):
@@ -129,13 +135,20 @@ class PoseBuffer:
         index = bisect_left(self._poses, stamp_ns, key=lambda pose: pose.stamp_ns)
         after = self._poses[index]
         if after.stamp_ns == stamp_ns:
-            around = self._poses[index - 1] if index else self._poses[min(1, len(self._poses) - 1)]
-            return replace(after, motion=_motion(around, after))
+            around = self._before(index) if index else self._poses[min(1, len(self._poses) - 1)]
+            return replace(after, motion=_motion(around, after), motion_time=_seconds(around, after))
         before = self._poses[index - 1]
         age = round(self.max_pose_age * 1e9)
         if stamp_ns - before.stamp_ns > age or after.stamp_ns - stamp_ns > age:
             return PoseRefusal.GAP
-        return self._between(before, after, stamp_ns)
+        earlier = self._before(index)
+        between = self._between(before, after, stamp_ns)
+        return replace(between, motion=_motion(earlier, after), motion_time=_seconds(earlier, after))
+
+    def _before(self, index: int) -> LensPose:
+        """The earliest pose within MOTION_TIME before that of an index, at least the one before it."""
+        start = self._poses[index].stamp_ns - MOTION_TIME_NS
+        return self._poses[min(bisect_left(self._poses, start, key=lambda pose: pose.stamp_ns), index - 1)]
 
     def _between(self, before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
         since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9
@@ -153,17 +166,21 @@ class PoseBuffer:
             position=(1.0 - share) * before.position + share * after.position,
             quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
             covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
-            motion=_motion(before, after),
         )
 
 
 def _motion(one: LensPose, other: LensPose) -> Array:
     """Velocity and turning (6,) between two poses; NaN between a pose and itself."""
-    seconds = (other.stamp_ns - one.stamp_ns) / 1e9
-    if not seconds:
+    if one is other:
         return np.full(6, np.nan)
     turn = Rotation.from_quat(other.quaternion_xyzw) * Rotation.from_quat(one.quaternion_xyzw).inv()
-    return np.asarray(np.concatenate([other.position - one.position, turn.as_rotvec()]) / seconds)
+    moved = np.concatenate([other.position - one.position, turn.as_rotvec()])
+    return np.asarray(moved / ((other.stamp_ns - one.stamp_ns) / 1e9))
+
+
+def _seconds(one: LensPose, other: LensPose) -> float:
+    """The time between two poses; infinite between a pose and itself."""
+    return abs(other.stamp_ns - one.stamp_ns) / 1e9 if one is not other else np.inf
 
 
 def _same_place(pose: LensPose, other: LensPose) -> bool:

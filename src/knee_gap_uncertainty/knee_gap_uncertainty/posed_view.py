@@ -51,6 +51,8 @@ def posed_view(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> 
             rotation_covariances=turn[None],
             lens_rotations=matrix[None],
             lens_motions=np.nan_to_num(pose.motion)[None],
+            motion_times=np.array([pose.motion_time]),
+            scope_turns=np.array([pose.scope_turn]),
             camera_errors=(matrix @ edges.camera_errors)[None],
         ),
     )

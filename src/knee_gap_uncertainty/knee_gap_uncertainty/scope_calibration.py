@@ -1,12 +1,12 @@
 """What the calibration of the scope does to a gap: an error that all views of a track share.
 
-A shift of the lens on its body is felt only where the scope turns between the views, a turn of it turns every
-bearing against the travel, a clock that is off moves the lens along its way, and a camera whose numbers are
-off turns each bearing by where it lies in the picture. None of it averages out, so it is no part of the
-covariance of a lens pose or a bearing: it is considered, as the common part of the image's error is. The
-gap's fit is taken as it is, and to its covariance comes what the shared error does to it. The camera's errors
-and those of the lens on its body are taken as independent, though one fit has found both and they mostly make
-up for each other.
+A shift of the lens on its body is felt only where the scope turns between the views, be it in its camera head
+(the picture then turns against the lens, and the error with it), a turn of it turns every bearing against the
+travel, a clock that is off moves the lens along its way, and a camera whose numbers are off turns each
+bearing by where it lies in the picture. None of it averages out, so it is no part of the covariance of a lens
+pose or a bearing: it is considered, as the common part of the image's error is. The gap's fit is taken as it
+is, and to its covariance comes what the shared error does to it. The camera's errors and those of the lens on
+its body are taken as independent, though one fit has found both and they mostly make up for each other.
 """
 
 from dataclasses import dataclass
@@ -79,9 +79,7 @@ class CalibrationError:
         `factor` times the RMS length. Half of a difference between the positions counts at either view.
         """
         shift, turn = self.covariance[:3, :3], self.covariance[3:, 3:]
-        assert first.view.lens_rotations is not None
-        assert present.view.lens_rotations is not None
-        felt = (present.view.lens_rotations[0] - first.view.lens_rotations[0]) / 2.0
+        felt = (present.view.calibrated_rotations[0] - first.view.calibrated_rotations[0]) / 2.0
         motions = [_motions(view.view)[0] for view in (first, present)]
         late = (motions[1][:3] - motions[0][:3]) / 2.0 * self.clock
         turned = max(float(motion[3:] @ motion[3:]) for motion in motions) * self.clock**2
@@ -107,8 +105,7 @@ class CalibrationError:
         By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
         moves all lenses alike moves the points with them, and their distance not at all.
         """
-        rotations = views.lens_rotations
-        assert rotations is not None
+        rotations = views.calibrated_rotations
         motions = _motions(views)
         by_camera = _camera_errors(views)
         count = 7 + by_camera.shape[-1]

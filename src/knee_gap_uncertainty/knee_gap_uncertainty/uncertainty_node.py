@@ -8,7 +8,7 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration
+from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.advice_task import AdvicePace
@@ -44,6 +44,7 @@ class UncertaintyNode(BaseNode):
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
+        self.create_subscription(ScopeTurn, "scope_turn", self.on_turn, RESULT_QOS)
         if self._estimator.parameters.leg_motion > 0.0:
             self.create_subscription(PoseStamped, "leg_body/pose", self.on_leg_pose, TRACKER_QOS)
         # Latched by two nodes: of each the last word is wanted.
@@ -86,6 +87,10 @@ class UncertaintyNode(BaseNode):
     def on_leg_pose(self, message: PoseStamped) -> None:
         """Take a pose of a body fixed to the leg, which must not move within a track."""
         self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
+
+    def on_turn(self, message: ScopeTurn) -> None:
+        """Take how far the scope is turned in its camera head."""
+        self._estimator.add_turn(messages.turn_from_message(message))
 
     def on_calibration(self, message: ScopeCalibration) -> None:
         """Take what a node says of its calibration of the scope."""

@@ -59,6 +59,8 @@ class ViewWindow:
             raise BadInputError("the window is empty: add a view first")
         rotations = [view.lens_rotations for view in self._views if view.lens_rotations is not None]
         motions = [view.lens_motions for view in self._views if view.lens_motions is not None]
+        times = [view.motion_times for view in self._views if view.motion_times is not None]
+        turns = [view.scope_turns for view in self._views if view.scope_turns is not None]
         return Views(
             lens_positions=np.concatenate([view.lens_positions for view in self._views]),
             bearings=np.concatenate([view.bearings for view in self._views]),
@@ -68,6 +70,8 @@ class ViewWindow:
             common_share=common_share,
             lens_rotations=np.concatenate(rotations) if len(rotations) == len(self._views) else None,
             lens_motions=np.concatenate(motions) if len(motions) == len(self._views) else None,
+            motion_times=np.concatenate(times) if len(times) == len(self._views) else None,
+            scope_turns=np.concatenate(turns) if len(turns) == len(self._views) else None,
             camera_errors=all_camera_errors(self._views),
         )
 

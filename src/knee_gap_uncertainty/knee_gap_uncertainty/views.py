@@ -30,9 +30,10 @@ class Views:
     `lens_rotations` (N, 3, 3) takes lens coordinates (z optical axis, x right, y down) to the frame of the
     points and so says which way those axes lie; without it the lens is taken to look at the middle of the gap
     and not to roll. `lens_motions` (N, 6) are its velocity [m/s] and turning [rad/s] in the frame of the
-    points, by which the error of a clock moves it; None where they are not known. `camera_errors`
-    (N, 2, 3, k) are displacements of the bearings [rad], one for each error of the camera's own numbers,
-    which all views share; None where there are none.
+    points, by which the error of a clock moves it, from two poses `motion_times` (N,) [s] apart; None where
+    they are not known. `camera_errors` (N, 2, 3, k) are displacements of the bearings [rad], one for each
+    error of the camera's own numbers, which all views share; None where there are none.
+    `scope_turns` (N,) [rad] say how far the scope was turned in its camera head; None where it was not.
 
     Raises BadInputError for the first value that breaks a rule.
     """
@@ -45,7 +46,9 @@ class Views:
     common_share: float = 0.5
     lens_rotations: Array | None = None
     lens_motions: Array | None = None
+    motion_times: Array | None = None
     camera_errors: Array | None = None
+    scope_turns: Array | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into contiguous float64 and check them."""
@@ -81,6 +84,10 @@ class Views:
             _check_rotations(self.lens_rotations, count)
         if self.lens_motions is not None:
             _check_shape("lens_motions", self.lens_motions, (count, 6))
+        if self.motion_times is not None and not (
+            self.motion_times.shape == (count,) and np.all(self.motion_times > 0.0)
+        ):
+            raise BadInputError(f"motion_times must be {count} times above 0 s, not {self.motion_times}")
         if self.camera_errors is not None:
             _check_shape("camera_errors", self.camera_errors, (count, 2, 3, self.camera_errors.shape[-1]))
         _check_covariance("bearing_covariances", self.bearing_covariances)
@@ -99,6 +106,8 @@ class Views:
         """These views and then `other`'s, with the common share of these."""
         rotations = (self.lens_rotations, other.lens_rotations)
         motions = (self.lens_motions, other.lens_motions)
+        times = (self.motion_times, other.motion_times)
+        turns = (self.scope_turns, other.scope_turns)
         return Views(
             lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
             bearings=np.concatenate([self.bearings, other.bearings]),
@@ -112,12 +121,34 @@ class Views:
             lens_motions=None
             if motions[0] is None or motions[1] is None
             else np.concatenate([motions[0], motions[1]]),
+            motion_times=None
+            if times[0] is None or times[1] is None
+            else np.concatenate([times[0], times[1]]),
             camera_errors=all_camera_errors([self, other]),
+            scope_turns=None
+            if turns[0] is None or turns[1] is None
+            else np.concatenate([turns[0], turns[1]]),
         )
 
     def __len__(self) -> int:
         """Number of views."""
         return len(self.lens_positions)
+
+    @property
+    def calibrated_rotations(self) -> Array:
+        """(N, 3, 3): what takes an error of the calibrated lens, in its own axes, to the frame of the points.
+
+        The picture of a scope that is turned in its camera head turns on the sensor, T_body_lens(turn) =
+        S(turn) T_body_lens(0) Rz(-turn): an error e of T_body_lens(0) is the error Rz(turn) e of the lens.
+        """
+        rotations = _steady_rotations(self.bearings) if self.lens_rotations is None else self.lens_rotations
+        if self.scope_turns is None or not self.scope_turns.any():
+            return rotations
+        cosine, sine = np.cos(self.scope_turns), np.sin(self.scope_turns)
+        by_turn = np.tile(np.eye(3), (len(self), 1, 1))
+        by_turn[:, 0, 0], by_turn[:, 0, 1] = cosine, -sine
+        by_turn[:, 1, 0], by_turn[:, 1, 1] = sine, cosine
+        return np.asarray(rotations @ by_turn)
 
     @property
     def lens_axes(self) -> Array:

@@ -72,6 +72,7 @@ def test_a_second_body_turns_the_lens_frame_by_frame() -> None:
         lens = tracker.update(body(k, T=head), [body(k, "post", head @ AXIS.turned(turn) @ T_HEAD_SCOPE)])
         assert isinstance(lens, LensPose)
         np.testing.assert_allclose(lens.matrix(), head @ TURNED.body_to_lens(turn), atol=1e-9)
+        assert lens.scope_turn == pytest.approx(turn)
         variances.append(np.trace(lens.covariance))
     # The further the scope is turned, the more the error of the shaft's axis counts.
     chord = 2 * np.sin(0.5 * turn)

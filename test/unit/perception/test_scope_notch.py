@@ -21,7 +21,7 @@ from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView
-from knee_gap_perception.messages_tracking import fill_scope_notch, notch_from_message
+from knee_gap_perception.messages_tracking import fill_scope_notch, fill_scope_turn, notch_from_message
 from knee_gap_perception.notch_follower import (
     FAR_AWAY,
     NO_FIELD,
@@ -36,6 +36,7 @@ from knee_gap_perception.poses import BodyPose, LensPose, rigid_transform
 from knee_gap_perception.tracking import NO_NOTCH_YET, ScopeTracker, TrackingParameters
 from knee_gap_perception.turned_poses import NO_POSES
 from knee_gap_replay.types import blank
+from knee_gap_uncertainty.messages import turn_from_message
 
 SHAPE = NotchShape(0.047, 0.0597)
 HEIGHT, WIDTH = 360, 640
@@ -193,6 +194,12 @@ def test_there_is_one_pose_an_image_turned_as_its_notch_says() -> None:
         error = to_vector(np.linalg.inv(expected) @ pose.matrix())
         assert np.linalg.norm(error[3:]) < 2e-6
         assert np.linalg.norm(error[:3]) < 2e-5
+        message = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), pose)
+        told = turn_from_message(message)
+        assert told.stamp_ns == pose.stamp_ns
+        assert told.turn == pytest.approx(0.5 * time)
+        assert message.header.frame_id == pose.child_frame_id
+    assert tracker.follows_turn
     assert tracker.notch_flaw == ""
     assert tracker.accepted_count == 15
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.calibration_fit import explained_by
 from knee_gap_uncertainty.gap_estimate import GapStatus
@@ -46,6 +47,35 @@ def test_without_noise_nothing_is_left_of_the_error(axis: int) -> None:
     before, after = residual(views), residual(shared.taken_from(views))
     assert after < 0.1 * SIGMA
     assert after < 0.35 * before or before < 0.1 * SIGMA
+
+
+def test_a_picture_that_turns_on_the_sensor_changes_nothing() -> None:
+    """What the lens's error does is the same, whichever way the picture is turned by the scope."""
+    views = Hand(np.random.default_rng(3), np.array([1e-3, -2e-3, 1e-3, 0.02, 0.01, -0.03, 4e-3])).views()
+    turns = np.linspace(-1.0, 2.0, len(views))
+    back = Rotation.from_rotvec(np.outer(-turns, [0.0, 0.0, 1.0])).as_matrix()
+    assert views.lens_rotations is not None
+    turned = replace(views, lens_rotations=views.lens_rotations @ back, scope_turns=turns)
+    error = CalibrationError(stated(*LARGE[:2]), LARGE[2])
+    one, other = explained_by(error, views), explained_by(error, turned)
+    assert one is not None
+    assert other is not None
+    np.testing.assert_allclose(other.parts, one.parts, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        other.taken_from(turned).lens_positions, one.taken_from(views).lens_positions, atol=1e-9
+    )
+
+
+def test_a_clock_taken_from_a_view_brings_the_noise_of_its_velocity() -> None:
+    """At x(t) - late v with v = (x(t) - x(t - T)) / T: late / T times two poses' errors come in."""
+    views = Hand(np.random.default_rng(4), np.zeros(7)).views()
+    timed = replace(views, motion_times=np.full(len(views), 0.02))
+    shared = explained_by(CalibrationError(stated(*LARGE[:2]), LARGE[2]), views)
+    assert shared is not None
+    late = shared._replace(parts=np.array([0, 0, 0, 0, 0, 0, 0.01]))
+    for name in ("lens_covariances", "rotation_covariances"):
+        np.testing.assert_allclose(getattr(late.taken_from(timed), name), 1.5 * getattr(views, name))
+        np.testing.assert_allclose(getattr(late.taken_from(views), name), getattr(views, name))
 
 
 def residual(views: Views) -> float:

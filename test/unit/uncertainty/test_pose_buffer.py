@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -50,6 +52,37 @@ def test_at_a_pose_it_is_that_pose():
     pose = buffer.at(truth.stamp_ns)
     np.testing.assert_array_equal(pose.position, truth.position)
     np.testing.assert_array_equal(pose.covariance, truth.covariance)
+
+
+def test_the_velocity_is_over_two_periods_so_that_the_trackers_noise_is_small_in_it():
+    rng, sigma = np.random.default_rng(3), 2e-5
+    buffer = PoseBuffer()
+    for i in range(400):
+        pose = even_motion(START_NS + i * PERIOD_NS)
+        buffer.add(replace(pose, position=pose.position + sigma * rng.standard_normal(3)))
+    off = []
+    for i in range(3, 399, 3):
+        for stamp in (START_NS + i * PERIOD_NS, START_NS + i * PERIOD_NS - 2_000_000):
+            pose = buffer.at(stamp)
+            assert isinstance(pose, LensPose)
+            assert pose.motion_time == pytest.approx(2e-9 * PERIOD_NS)
+            off.append(pose.motion - [0.01, -0.02, 0.05, *(0.7 * AXIS)])
+    assert np.std(np.array(off)[:, :3]) == pytest.approx(np.sqrt(2.0) * sigma / (2e-9 * PERIOD_NS), rel=0.1)
+    assert np.abs(np.array(off)[:, 3:]).max() < 1e-6
+
+
+def test_a_velocity_over_a_longer_time_is_taken_where_poses_are_rare():
+    buffer = PoseBuffer()
+    for i in range(4):
+        buffer.add(even_motion(START_NS + i * 30_000_000))
+    pose = buffer.at(START_NS + 70_000_000)
+    assert isinstance(pose, LensPose)
+    assert pose.motion_time == pytest.approx(0.03)
+    np.testing.assert_allclose(pose.motion[:3], [0.01, -0.02, 0.05], rtol=1e-5)
+    first = buffer.at(START_NS)
+    assert isinstance(first, LensPose)
+    assert first.motion_time == pytest.approx(0.03)
+    np.testing.assert_allclose(first.motion[:3], [0.01, -0.02, 0.05], rtol=1e-5)
 
 
 def test_interpolation_does_not_depend_on_the_frame():

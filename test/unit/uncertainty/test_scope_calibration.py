@@ -11,7 +11,9 @@ from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
+from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns
 from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
 
 Array = npt.NDArray[np.float64]
@@ -72,6 +74,101 @@ def test_a_shift_is_not_felt_by_a_scope_that_does_not_turn() -> None:
     covariance = np.diag([1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0])  # a millimetre
     assert spread(covariance, 0.0, scope(20, turning=0.0)) < 1e-9
     assert spread(covariance, 0.0, scope(20, turning=0.3)) > 1e-5
+
+
+def turned_scope(count: int, oblique: float, wrong: Array, turn: float = 0.6) -> Views:
+    """Perfect views of a scope that travels 4 mm while it is turned in its camera head by +- `turn`.
+
+    T_body_lens(turn) = S(turn) T_body_lens(0) Rz(-turn), the axis of S 1 mm beside the lens; of
+    T_body_lens(0) a scope that is `wrong` (6,), a shift [m] and a rotation [rad] in the lens's own axes, is
+    known.
+    """
+    turns = np.linspace(-turn, turn, count)
+    tilt, axis_point = Rotation.from_rotvec([oblique, 0.0, 0.0]), np.array([0.001, 0.0, 0.0])
+    lenses, rotations, bearings = [], [], []
+    for share, angle in zip(np.linspace(0.0, 1.0, count), turns, strict=True):
+        S, back = Rotation.from_rotvec([0.0, 0.0, angle]), Rotation.from_rotvec([0.0, 0.0, -angle])
+        # The camera head only travels; it is turned so that the lens looks ahead at turn 0.
+        head = tilt.inv()
+        lens = share**2 * np.array([0.004, 0.0005, 0.0])
+        rotation = head * S * tilt * back
+        offset = S.apply(-axis_point) + axis_point  # of the lens in the head
+        at_head = lens - head.apply(offset)
+        towards = POINTS - lens
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        seen = rotation.inv().apply(towards)
+        known = head * S * tilt * Rotation.from_rotvec(wrong[3:]) * back
+        lenses.append(at_head + head.apply(offset + S.apply(tilt.apply(wrong[:3]))))
+        rotations.append(known.as_matrix())
+        bearings.append(known.apply(seen))
+    return Views(
+        np.array(lenses),
+        np.array(bearings),
+        bearing_covariances(np.array(bearings), 2e-3),
+        isotropic_covariances(count, 2e-5),
+        isotropic_covariances(count, 1e-4),
+        lens_rotations=np.array(rotations),
+        scope_turns=turns,
+    )
+
+
+@pytest.mark.parametrize("oblique", [0.0, np.radians(30.0)])
+@pytest.mark.parametrize("axis", range(6))
+def test_a_scope_turned_in_its_camera_head_turns_the_error_too(axis: int, oblique: float) -> None:
+    size = 3e-4 if axis < 3 else 2e-3
+    wrong = np.zeros(6)
+    wrong[axis] = size
+    shown = abs(fit(turned_scope(20, oblique, wrong)).gap - fit(turned_scope(20, oblique, -wrong)).gap) / 2.0
+    covariance = np.diag(wrong**2)
+    told = spread(covariance, 0.0, turned_scope(20, oblique, np.zeros(6)))
+    assert told == pytest.approx(shown, rel=0.15, abs=2e-6)
+
+
+def test_the_bounds_hold_a_shift_that_the_turned_scope_carries_about() -> None:
+    """The picture of a straight scope does not turn with it, and the lens that is off its axis goes round."""
+    views = turned_scope(2, 0.0, np.zeros(6), turn=0.5)
+    first, present = (posed(views, k) for k in (0, 1))
+    shift = 1e-4
+    _, position = CalibrationError(np.diag([shift**2, 0, 0, 0, 0, 0]), 0.0).bounds(first, present, 1.0)
+    assert position == pytest.approx(shift * np.sin(0.5), rel=1e-6)
+
+
+def posed(views: Views, k: int) -> PosedView:
+    """One of the views as the estimator makes it of an image and a pose."""
+    assert views.lens_rotations is not None
+    assert views.scope_turns is not None
+    bearings = views.bearings[k] @ views.lens_rotations[k]
+    edges = EdgeObservation(1, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3)
+    quaternion = Rotation.from_matrix(views.lens_rotations[k]).as_quat()
+    pose = LensPose(1, "world", views.lens_positions[k], quaternion, np.diag([1e-10] * 3 + [1e-9] * 3))
+    return posed_view(edges, replace(pose, scope_turn=float(views.scope_turns[k])), 3.0)
+
+
+def test_the_estimator_is_told_how_far_the_scope_is_turned() -> None:
+    """A millimetre of the lens on its body is nothing to a scope never turned, and much to one that is."""
+    shift = told("tracking_node", "a" * 64, error=np.diag([1e-6, 1e-6, 0, 0, 0, 0]))
+    steady = estimates(shift, turning=0.0)[-1]
+    assert steady.gap_max - steady.gap_min == pytest.approx(
+        estimates(turning=0.0)[-1].gap_max - estimates(turning=0.0)[-1].gap_min
+    )
+    turned = estimates(shift, turning=0.0, scope_turn=0.2)[-1]
+    assert turned.gap == pytest.approx(steady.gap)
+    for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
+        assert getattr(turned, low) < getattr(steady, low)
+        assert getattr(turned, high) > getattr(steady, high)
+
+
+def test_turns_are_kept_by_their_stamps() -> None:
+    turns = ScopeTurns()
+    assert turns.at(5) == 0.0
+    for stamp in range(1000):
+        turns.add(ScopeTurn(10 * stamp, 1e-3 * stamp))
+    assert turns.at(9_004) == pytest.approx(0.9)
+    assert turns.at(9_006) == pytest.approx(0.901)
+    turns.add(ScopeTurn(10_000, float("nan")))
+    assert turns.at(20_000) == pytest.approx(0.999)
+    turns.add(ScopeTurn(20, 0.5))  # a bag that starts again
+    assert turns.at(9_000) == 0.5
 
 
 def test_it_does_not_average_out() -> None:
@@ -144,9 +241,14 @@ def test_nodes_with_different_calibrations_contradict_each_other() -> None:
     assert "x none" in contradiction({"tracking_node": one, "x": none})
 
 
-def estimates(*calibrations: ScopeCalibration, camera: float = 0.0) -> list[GapEstimate]:
-    """What the estimator says of 40 views of the travelling scope, `camera` times its errors told."""
-    estimator, views, found = GapEstimator(), scope(40), []
+def estimates(
+    *calibrations: ScopeCalibration, camera: float = 0.0, turning: float = 0.3, scope_turn: float = 0.0
+) -> list[GapEstimate]:
+    """What the estimator says of 40 views of the travelling scope, `camera` times its errors told.
+
+    It turns in its camera head by `scope_turn` [rad] on the way.
+    """
+    estimator, views, found = GapEstimator(), scope(40, turning), []
     errors = camera * camera_errors(views, 0, 1, 2)
     for calibration in calibrations:
         estimator.add_calibration(calibration)
@@ -166,6 +268,8 @@ def estimates(*calibrations: ScopeCalibration, camera: float = 0.0) -> list[GapE
             Rotation.from_matrix(rotation).as_quat(),
             np.diag([1e-10] * 3 + [1e-9] * 3),
         )
+        if scope_turn:
+            estimator.add_turn(ScopeTurn(stamp_ns, scope_turn * k / 39))
         estimator.add_pose(pose, stamp_ns)
         found += estimator.add_edges(edges, stamp_ns)
     return found
