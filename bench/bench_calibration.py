@@ -35,7 +35,7 @@ MOST_SHIFT, MOST_TURN, MOST_TIME = 0.2e-3, np.radians(0.2), 1e-3
 
 def judged(recording: CalibrationRecording, folder: Path, views: int) -> tuple[float, bool]:
     """NEES of one scope's lens, and whether all is within the limits; prints the line."""
-    truth, bag, into = calibration_truth(recording), folder / "bag", folder / "scope.yaml"
+    truth, bag, into = calibration_truth(recording), folder / "bag", folder / "calibration.yaml"
     make_calibration_bag(bag, recording)
     board = ["--board", truth.board.text, "--into", str(into), "--views", str(views)]
     model = ["--model", MODELS[recording.lens]]

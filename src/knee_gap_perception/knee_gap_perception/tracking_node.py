@@ -26,6 +26,8 @@ from knee_gap_perception.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.poses import LensPose
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 
+# After so many diagnostics, one a second, a source that still gives nothing is told in the log as well.
+DIAGNOSTICS_TO_LOG = 5
 # How long one look at NatNet's socket may wait [s]: as long as the node may take to end.
 NATNET_WAIT = 0.1
 
@@ -42,6 +44,8 @@ class TrackingNode(BaseNode):
         self._accepted_before = 0
         # Since the last diagnostics, and why the last of them was.
         self._refused, self._why_refused = 0, ""
+        # Diagnostics in a row without a sound source.
+        self._silent = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
             self._tracker = ScopeTracker(
@@ -145,6 +149,9 @@ class TrackingNode(BaseNode):
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
         source = self._feed.status()
+        self._silent = 0 if source.ok else self._silent + 1
+        if self._silent == DIAGNOSTICS_TO_LOG:
+            self.get_logger().warning(source.words)
         refused: dict[str, object] = {
             f"refused: {reason}": count for reason, count in dict(self._tracker.validity.counts).items()
         }

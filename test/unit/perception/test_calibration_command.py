@@ -87,6 +87,9 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["time_offset", "BAG", "--into", "OUT", "--pose-topic", "/nowhere"], "/knee_gap/scope_body/pose"),
         (["oblique", "BAG", "--into", "OUT", "--board", BOARD, "--end", "2"], "about a second"),
         (["pivot", "BAG", "--into", "OUT"], "calibrate intrinsics first"),
+        (["intrinsics", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "500"], "from 500 s"),
+        (["hand_eye", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "5", "--end", "2"], "lie before"),
+        (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "a folder that may be written"),
         (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
     ],
@@ -95,7 +98,8 @@ def test_mistakes_are_one_line(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], reason: str
 ) -> None:
     places = {"BAG": str(bag), "OUT": str(tmp_path / "scope.yaml"), "NOWHERE": str(tmp_path / "nowhere")}
-    code, _, errors = run(capsys, *(places.get(argument, argument) for argument in arguments))
+    given = [argument.replace("NOWHERE", places["NOWHERE"]) for argument in arguments]
+    code, _, errors = run(capsys, *(places.get(argument, argument) for argument in given))
     assert code == 1
     assert len(errors) == 1
     assert reason in errors[0]

@@ -92,6 +92,7 @@ def test_a_file_changed_by_hand_is_refused(tmp_path: Path) -> None:
         ("a: [", "not YAML"),
         ("a: 1", "no calibration"),
         ("format: knee_gap_calibration 1\nimage: 3", "malformed"),
+        ("format: knee_gap_calibration 1\nhash: abc", "'image' is missing"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, text: str, reason: str) -> None:

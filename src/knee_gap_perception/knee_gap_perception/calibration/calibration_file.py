@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,14 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         raise PerceptionError(f"{path} cannot be written: {error.strerror}") from None
 
 
+def require_place(path: Path) -> None:
+    """Raise PerceptionError where no calibration can be written, before it has taken minutes to make."""
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise PerceptionError(
+            f"{path} cannot be written: it must name a file in a folder that may be written"
+        )
+
+
 def load_calibration(path: Path) -> Calibration:
     """Read a calibration.
 
@@ -223,7 +232,9 @@ def load_calibration(path: Path) -> Calibration:
         raise PerceptionError(f"{path} is no calibration: its format must be '{FORMAT}'")
     try:
         calibration = _from_dict(content)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except KeyError as error:
+        raise PerceptionError(f"the calibration {path} is incomplete: {error} is missing") from None
+    except (TypeError, ValueError, AttributeError) as error:
         raise PerceptionError(f"the calibration {path} is incomplete or malformed: {error!r}") from None
     if calibration.hash != content.get("hash"):
         raise PerceptionError(

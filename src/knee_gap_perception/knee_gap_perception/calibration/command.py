@@ -10,7 +10,12 @@ from rosbags.serde import SerdeError
 from tqdm import tqdm
 
 from knee_gap_perception.calibration.boards import BOARD_SYNTAX, board_from_text
-from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration, save_calibration
+from knee_gap_perception.calibration.calibration_file import (
+    Calibration,
+    load_calibration,
+    require_place,
+    save_calibration,
+)
 from knee_gap_perception.calibration.lens_model import NAMES, LensModel
 from knee_gap_perception.calibration.procedure import Procedure
 from knee_gap_perception.calibration.recording import Recording, Request
@@ -91,6 +96,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         begin=arguments.begin,
         end=arguments.end,
     )
+    require_place(arguments.into)
     recording = Recording(request, _progress)
     procedure = Procedure(recording, lambda line: print(f"  {line}", flush=True))
     calibration = load_calibration(arguments.into) if arguments.into.exists() else None

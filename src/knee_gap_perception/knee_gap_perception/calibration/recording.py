@@ -43,6 +43,11 @@ class Request:
             raise PerceptionError(f"--views must lie in [4, 500], not {self.views}")
         if not 0.0 < self.max_offset <= 2.0:
             raise PerceptionError(f"--max-offset must lie in (0, 2] s, not {self.max_offset}")
+        if not 0.0 <= self.begin < self.end:
+            raise PerceptionError(
+                f"--begin must lie before --end, and neither before the bag's start: not {self.begin:g} s "
+                f"and {self.end:g} s"
+            )
 
 
 class Recording:
@@ -98,6 +103,10 @@ class Recording:
             except PerceptionError:
                 track = None
             stamps = bag.image_stamps(request.image_topic)
+            if len(stamps) == 0:
+                raise PerceptionError(
+                    f"no image of {request.image_topic} is in {_words(bag)} of {request.bag}"
+                )
             chosen = still_stamps(stamps, request.views, track, self.offset(calibration))
             if len(chosen) == 0:
                 raise PerceptionError(
@@ -114,3 +123,9 @@ class Recording:
         if self.request.time_offset is not None:
             return self.request.time_offset
         return calibration.clock.offset if calibration and calibration.clock else 0.0
+
+
+def _words(part: CalibrationBag) -> str:
+    """The part of a bag that is read, in words."""
+    whole = part.begin == 0.0 and not np.isfinite(part.end)
+    return "any part" if whole else f"the part from {part.begin:g} s to {part.end:g} s"
