@@ -247,7 +247,9 @@ class GapEdgeDetector:
             raise _NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
             )
-        first, second = (PointTrack(grey, point.pixel, point.dark_below, camera, view) for point in points)
+        first, second = (
+            PointTrack(grey, point.pixel, point.dark_below, camera, view, point.kind) for point in points
+        )
         self._tracks += 1
         self._seen_ns = stamp_ns
         self._track = _Track(

@@ -23,18 +23,20 @@ Image = npt.NDArray[np.uint8]
 
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
 ONE_SIDED, FULL_SIDED = 0.75, 0.97  # share of that window on the surface: from no weight to full
-SMOOTHING = 1.3  # [px] standard deviation: what is finer is noise
+SMOOTHING = 1.8  # [px] standard deviation: what is finer is noise
 FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
 NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
 SPARKLE = 1.12  # the same for a pixel against its window: small highlights
+SPECK = 6.0  # times the usual detail of a surface, from which something bright is not of it
+SPECK_RIM = 7  # [px] side of what is left out around each of its pixels
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
 CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 5.0  # growth of the error's logarithm as the correlation falls below that
+DOUBT = 4.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
-NOISE_CORRELATION = 2.5  # factor on the variance: the residuals of neighbouring pixels are not independent
+NOISE_CORRELATION = 1.6  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
 CONVERGED = 0.02  # [px]
 FINISHING = 2  # iterations in which only gradients count that both textures have
@@ -117,9 +119,22 @@ def surface_around(
     # Beside an edge the window is one-sided: the shading towards a contour would pass for texture, and slide.
     sided = np.clip((count / (window[0] * window[1]) - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
     sparkle = np.clip((smooth / np.maximum(mean, 1.0) - SPARKLE) / 0.15, 0.0, 1.0)
+    surface = surface * _without_specks(detail, surface)
     weight = (surface * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
     faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
     return Surface(detail / (strength + faint), weight, (column, row))
+
+
+def _without_specks(detail: Float32, surface: npt.NDArray[Any]) -> Float32:
+    """Weight (h, w) that is 0 on and around what is far brighter than any detail of the surface usually is.
+
+    Shreds that drift by are pale and near the lamp. One of them on smooth cartilage would be all the texture
+    there is, and carry the patch away.
+    """
+    few = np.abs(detail[::4, ::4][surface[::4, ::4] > 0])
+    usual = float(np.median(few)) if few.size else 0.0
+    specks = (detail > SPECK * max(usual, FAINT)).astype(np.uint8)
+    return np.asarray(1.0 - cv2.dilate(specks, np.ones((SPECK_RIM, SPECK_RIM), np.uint8)), np.float32)
 
 
 def _odd(size: float) -> int:
@@ -154,9 +169,9 @@ class Patch:
         self.coverage = float(self.weight.sum() / window.sum())
         dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
         dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
-        # Neighbours tell nearly the same: every other pixel, as on a chessboard, costs no accuracy.
-        chessboard = np.indices((side, side)).sum(axis=0) % 2 == 0
-        self._pixels = np.stack([self.texture, dx, dy, self.weight * chessboard], axis=-1).astype(np.float32)
+        # Neighbours tell nearly the same: every other pixel of every other line costs no accuracy.
+        sparse = (np.indices((side, side)) % 2 == 0).all(axis=0)
+        self._pixels = np.stack([self.texture, dx, dy, self.weight * sparse], axis=-1).astype(np.float32)
 
     def information(self, limit: float = float("inf")) -> Array:
         """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift.

@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_perception.camera import Camera
+from knee_gap_perception.edges import EdgeKind
 from knee_gap_perception.local_plane import LocalPlane, Prediction, View
 from knee_gap_perception.patch_registration import Patch, Registration, Surface, Warp, surface_around
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
-PATCH_HALF = 32  # [px] half side of a patch
+PATCH_HALF = 48  # [px] half side of a patch
 SEARCH = 16  # [px] how far the point may be from its prediction
 CROP_HALF = int(1.5 * PATCH_HALF) + SEARCH
 MILD = (
@@ -38,11 +39,16 @@ FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch aw
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
 HANDOVER_ERROR = 0.10  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.06  # [px] below which no registration is believed
+REGISTRATION_FLOOR = 0.10  # [px] below which no registration is believed
 # Errors that grow with the parallax since the first image: light that moves, relief that is no plane. They
-# stretch or shrink the parallax more than they turn it.
-PARALLAX_ERROR = 0.004  # [-] of the parallax, along it
-PARALLAX_TURN = 0.0013  # [-] the same across it
+# stretch or shrink the parallax more than they turn it. Towards a contour the surface bends away; beside
+# mere shading the light carries what is seen.
+PARALLAX_ERROR = {  # [-] of the parallax, along it and across it
+    EdgeKind.RIM: (0.003, 0.0015),
+    EdgeKind.CONTOUR: (0.005, 0.003),
+    EdgeKind.SHADING: (0.2, 0.02),
+    EdgeKind.UNKNOWN: (0.005, 0.003),
+}
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
@@ -80,9 +86,19 @@ class PointTrack:
     """Follows one surface point through a stream of grey images."""
 
     def __init__(
-        self, grey: Image, pixel: Array, dark_below: float, camera: Camera, view: View | None
+        self,
+        grey: Image,
+        pixel: Array,
+        dark_below: float,
+        camera: Camera,
+        view: View | None,
+        kind: EdgeKind = EdgeKind.UNKNOWN,
     ) -> None:
-        """Start at a pixel (2,) of an image (h, w); grey levels below `dark_below` are the gap."""
+        """Start at a pixel (2,) of an image (h, w); grey levels below `dark_below` are the gap.
+
+        `kind` is that of the edge beside it.
+        """
+        self._parallax_error = PARALLAX_ERROR[kind]
         surface = surface_around(grey, pixel, CROP_HALF, dark_below)
         patch = Patch(surface, pixel, PATCH_HALF)
         self._anchors = [_Anchor(patch, pixel, view, np.eye(2), np.zeros((2, 2)), np.zeros(2))]
@@ -164,7 +180,7 @@ class PointTrack:
         warp = Warp(self._warp.position + self._velocity, self._warp.shape @ np.linalg.inv(anchor.shape))
         covariance = np.diag([(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4)
         # What the last image did not tell about the point, this one has to.
-        known = anchor.covariance + _drift(anchor.parallax)
+        known = anchor.covariance + self._drift(anchor.parallax)
         excess = float(np.linalg.eigvalsh(self._covariance - known)[-1])
         covariance[:2, :2] += max(excess, 0.0) * np.eye(2)
         return Prediction(warp, covariance, np.zeros((6, 3)), warp.position - anchor.pixel)
@@ -195,7 +211,7 @@ class PointTrack:
         self._velocity = 0.8 * self._velocity
         newest = self._anchors[-1]
         self._warp = Warp(prediction.warp.position, prediction.warp.shape @ newest.shape)
-        drift = _drift(newest.parallax + prediction.parallax)
+        drift = self._drift(newest.parallax + prediction.parallax)
         self._covariance = newest.covariance + drift + prediction.covariance[:2, :2]
         return Sighting(prediction.warp.position, self._covariance, False, 0.0)
 
@@ -205,7 +221,7 @@ class PointTrack:
         anchor = self._anchors[index]
         parallax = anchor.parallax + prediction.parallax
         own = anchor.covariance + found.covariance[:2, :2] + REGISTRATION_FLOOR**2 * np.eye(2)
-        covariance = own + _drift(parallax)
+        covariance = own + self._drift(parallax)
         moved = found.warp.position - self._warp.position
         self._velocity = np.zeros(2) if self._unseen else 0.5 * self._velocity + 0.5 * moved
         self._unseen = 0
@@ -224,19 +240,18 @@ class PointTrack:
             self._anchors.append(_Anchor(patch, found.warp.position, view, self._warp.shape, grown, parallax))
         return Sighting(found.warp.position, covariance, True, found.correlation)
 
+    def _drift(self, parallax: Array) -> Array:
+        """Covariance (2, 2) [px^2] of the errors that grow with a parallax (2,) [px]."""
+        along, across = np.square(self._parallax_error)
+        size = float(parallax @ parallax)
+        return np.asarray((along - across) * np.outer(parallax, parallax) + across * size * np.eye(2))
+
 
 def _level(grey: Image, position: Array) -> float:
     """Brightness of the tissue around a pixel: the upper quartile of a sparse neighbourhood."""
     row, column = round(float(position[1])), round(float(position[0]))
     patch = grey[max(0, row - 24) : row + 25 : 4, max(0, column - 24) : column + 25 : 4]
     return float(np.percentile(patch, 75)) if patch.size else 0.0
-
-
-def _drift(parallax: Array) -> Array:
-    """Covariance (2, 2) [px^2] of the errors that grow with a parallax (2,) [px]."""
-    along = PARALLAX_ERROR**2 - PARALLAX_TURN**2
-    across = PARALLAX_TURN**2 * float(parallax @ parallax)
-    return np.asarray(along * np.outer(parallax, parallax) + across * np.eye(2))
 
 
 def _spread(prediction: Prediction) -> float:

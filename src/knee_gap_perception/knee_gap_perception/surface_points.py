@@ -68,7 +68,10 @@ def choose_points(
                 places = [edge + share * inset_px * outward for share in INSETS]
                 candidates += [_judge(grey, place, dark_below, shift, edge, outward) for place in places]
         usable = [point for point in candidates if field.depth_inside(point.pixel) > 2 * PATCH_HALF]
-        best = max(usable, key=lambda point: point.texture, default=None)
+        # Where nothing ends, what looks like the surface's texture may be another one behind it.
+        best = max(
+            usable, key=lambda point: (point.kind is not EdgeKind.SHADING, point.texture), default=None
+        )
         if best is None or best.texture <= 0:
             return None
         chosen.append(best)

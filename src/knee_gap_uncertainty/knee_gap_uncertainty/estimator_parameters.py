@@ -48,7 +48,7 @@ class EstimatorParameters:
         },
     )
     depth_drift: float = field(
-        default=0.006,
+        default=0.008,
         metadata={
             "description": "standard deviation of the share of its parallax by which the image carries a "
             "point too far or not far enough, the same over a track [-]",

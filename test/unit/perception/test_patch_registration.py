@@ -109,14 +109,28 @@ def test_shading_beside_an_edge_holds_a_patch_back_less_through_a_window_that_gr
     assert errors[:, 0].mean() < 0.5 * errors[:, 1].mean()
 
 
-def test_one_spot_of_debris_is_not_taken_for_texture_to_follow():
+def test_one_spot_of_dark_debris_is_not_taken_for_texture_to_follow():
     rng = np.random.default_rng(1)
     textured = _patch(_seen(_speckle(rng, 12.0), np.zeros(2), 1.0, rng))
-    rows, columns = np.mgrid[:256, :256] - 118.0
-    spot = _speckle(rng, 1.0) + 60.0 * np.exp(-(rows**2 + columns**2) / (2 * 2.5**2))
-    spotted = _patch(_seen(spot, np.zeros(2), 1.0, rng))
+    spotted = _patch(_seen(_speckle(rng, 1.0) - _shred(np.array([118.0, 118.0])), np.zeros(2), 1.0, rng))
     share = [
         np.linalg.eigvalsh(patch.information(1.5))[0] / np.linalg.eigvalsh(patch.information())[0]
         for patch in (textured, spotted)
     ]
     assert share[1] < 0.9 * share[0]
+
+
+def _shred(place: np.ndarray) -> np.ndarray:
+    """Light (256, 256) that a small piece of something pale adds where it drifts by."""
+    rows, columns = np.mgrid[:256, :256]
+    return 60.0 * np.exp(-((columns - place[0]) ** 2 + (rows - place[1]) ** 2) / (2 * 2.5**2))
+
+
+def test_a_pale_shred_that_drifts_by_does_not_carry_the_patch_away():
+    """The surface stands still, all but even; a shred moves on by 5 px, and the search begins between."""
+    rng = np.random.default_rng(2)
+    surface, place = _speckle(rng, 0.5), CENTRE + np.array([6.0, 3.0])
+    patch = _patch(_seen(surface + _shred(place), np.zeros(2), 1.0, rng))
+    image = _seen(surface + _shred(place + np.array([5.0, 0.0])), np.zeros(2), 1.0, rng)
+    found = _find(patch, image, np.array([2.0, 0.0]))
+    assert np.abs(found.warp.position - CENTRE).max() < 1.0
