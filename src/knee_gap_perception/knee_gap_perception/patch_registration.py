@@ -119,8 +119,8 @@ def surface_around(
     # Beside an edge the window is one-sided: the shading towards a contour would pass for texture, and slide.
     sided = np.clip((count / (window[0] * window[1]) - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
     sparkle = np.clip((smooth / np.maximum(mean, 1.0) - SPARKLE) / 0.15, 0.0, 1.0)
-    surface = surface * _without_specks(detail, surface)
-    weight = (surface * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
+    clear = surface * _without_specks(detail, surface)
+    weight = (clear * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
     faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
     return Surface(detail / (strength + faint), weight, (column, row))
 
