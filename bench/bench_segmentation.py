@@ -4,6 +4,10 @@ Dice is told inside the field disc, mean and 10th percentile over frames, for ev
 size and, to show what that costs, at full size. A false gap is a frame of a closed joint, or a real frame
 without a cleft, in which points were chosen. The reliability table says of the sections found in open and in
 closed joints, weighted alike, how many are gaps at each confidence.
+
+`--decision` leaves Dice out: many joints, open and closed, each with one direction of travel in turn and
+mostly with one image, as images of the same joint are wrong together. The interval is that of Clopper and
+Pearson (1934) at 95 %, over joints: a joint counts as wrong by the share of its images that are.
 """
 
 import argparse
@@ -18,6 +22,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
+from kept_frames import frames_of
+from scipy.stats import beta
 from tqdm import tqdm
 
 from knee_gap_perception.camera import Camera, FisheyeCamera
@@ -26,6 +32,7 @@ from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeStatus
 from knee_gap_simulation.bench import FROM_SEED, Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.motion import TravelDirection
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -54,10 +61,73 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--strategy", nargs="+", choices=STRATEGIES, default=["otsu", "otsu3", "watershed"])
     parser.add_argument("--full-size", action="store_true", help="the first strategy at full size as well")
     parser.add_argument("--no-gap", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--real", type=Path, nargs="*", default=[], help="real frames: folders or videos")
+    parser.add_argument("--keep", type=Path, help="folder in which rendered images are kept")
     parser.add_argument(
-        "--real", type=Path, nargs="*", default=[], help="real frames without a cleft: folders or videos"
+        "--decision",
+        nargs="+",
+        choices=("open", "closed"),
+        help="no Dice, only decisions, on such joints",
     )
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of wrong decisions")
     asked = parser.parse_args(argv)
+    judged = decisions(asked) if asked.decision else scores_and_decisions(asked)
+    for path in asked.real:
+        frames = [judge_real(picture) for picture in pictures(path)]
+        print(f"{path.name}: gap called in {share(frames):.1%} of {len(frames)} frames")
+    print_reliability(judged)
+    return 0
+
+
+def decisions(asked: argparse.Namespace) -> list[Judged]:
+    """Decide on every joint, tell how often it was wrong, and keep the pictures."""
+    judged: list[Judged] = []
+    directions = list(TravelDirection)
+    for level in asked.level:
+        for kind in asked.decision:
+            joints = []
+            for seed in tqdm(asked.seed, desc=f"level {level}, {kind}", disable=not sys.stderr.isatty()):
+                direction = directions[seed % len(directions)]
+                frames = []
+                for frame, camera in rendered_one(level, seed, direction, asked, is_open=kind == "open"):
+                    frames.append(judge(frame, camera))
+                    if asked.pictures and frames[-1].found != (kind == "open"):
+                        keep_picture(asked.pictures, f"{kind}_{level}_{seed}_{frame.index}", frame, camera)
+                joints += [frames] if frames else []
+            images = sum(map(len, joints))
+            wrong = float(np.sum([np.mean([f.found for f in frames]) for frames in joints]))
+            low, high = interval(wrong, len(joints))
+            print(
+                f"level {level}  gap called in {wrong / max(len(joints), 1):.1%} ({low:.1%} to {high:.1%}) "
+                f"of {images} images of {len(joints)} {kind} joints",
+                flush=True,
+            )
+            judged += [frame for frames in joints for frame in frames]
+    return judged
+
+
+def interval(count: float, of: int) -> tuple[float, float]:
+    """Interval of Clopper and Pearson for a share, at 95 %."""
+    low = float(beta.ppf(0.025, count, of - count + 1)) if count > 0 else 0.0
+    high = float(beta.ppf(0.975, count + 1, of - count)) if count < of else 1.0
+    return low, high
+
+
+def keep_picture(folder: Path, name: str, frame: BenchFrame, camera: Camera) -> None:
+    """The picture of a wrong decision, by itself and with the mask's outline and the confidence."""
+    detector = GapEdgeDetector()
+    detector.process(0, frame.image, camera)
+    drawn = frame.image.copy()
+    outlines, _ = cv2.findContours(detector.gap_mask(), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, outlines, -1, (0, 255, 0), 1)
+    told = detector.reason or f"confidence {detector.confidence:.2f}"
+    cv2.putText(drawn, told, (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
+    folder.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(folder / f"{name}.png"), np.hstack([frame.image, drawn]))
+
+
+def scores_and_decisions(asked: argparse.Namespace) -> list[Judged]:
+    """Dice of every strategy, and the decision on the same frames."""
     judged: list[Judged] = []
     for level in asked.level:
         scores: dict[str, list[float]] = defaultdict(list)
@@ -83,29 +153,32 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"level {level}  false gap in {share(closed):.1%} of {len(closed)} closed joints", flush=True
             )
             judged += closed
-    for path in asked.real:
-        frames = [judge_real(picture) for picture in pictures(path)]
-        print(f"{path.name}: false gap in {share(frames):.1%} of {len(frames)} frames")
-    print_reliability(judged)
-    return 0
+    return judged
 
 
 def rendered(level: int, asked: argparse.Namespace, *, is_open: bool) -> Iterator[tuple[BenchFrame, Camera]]:
     """Frames of every seed and direction, spread over the travel."""
     jobs = [(direction, seed) for direction in asked.travel_direction for seed in asked.seed]
     for direction, seed in tqdm(jobs, desc=f"level {level}", disable=not sys.stderr.isatty()):
-        try:
-            bench = Bench(level, seed, direction, gap=FROM_SEED if is_open else None)
-        except SimulationError as error:
-            print(f"bench_segmentation: seed {seed} {direction} left out: {error}", file=sys.stderr)
-            continue
-        lens = bench.lens
-        camera = FisheyeCamera(
-            lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
-        )
-        step = max(1, bench.frame_count // asked.frames)
-        for frame in bench.frames(step // 2, bench.frame_count, step):
-            yield frame, camera
+        yield from rendered_one(level, seed, direction, asked, is_open=is_open)
+
+
+def rendered_one(
+    level: int, seed: int, direction: str, asked: argparse.Namespace, *, is_open: bool
+) -> Iterator[tuple[BenchFrame, Camera]]:
+    """Frames of one joint, spread over the travel; none, and it says so, where the travel does not fit."""
+    try:
+        bench = Bench(level, seed, direction, gap=FROM_SEED if is_open else None)
+    except SimulationError as error:
+        print(f"bench_segmentation: seed {seed} {direction} left out: {error}", file=sys.stderr)
+        return
+    lens = bench.lens
+    camera = FisheyeCamera(
+        lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
+    )
+    step = max(1, bench.frame_count // asked.frames)
+    for frame in frames_of(bench, asked.keep, step // 2, step):
+        yield frame, camera
 
 
 def dice_of(frame: BenchFrame, camera: Camera, parameters: EdgeParameters) -> float:

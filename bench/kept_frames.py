@@ -10,21 +10,24 @@ from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.imaging import decoded
 
 
-def frames_of(bench: Bench, folder: Path | None) -> Iterator[BenchFrame]:
-    """The images of a bench: from the folder where they are all kept there, else rendered and kept."""
+def frames_of(bench: Bench, folder: Path | None, start: int = 0, step: int = 1) -> Iterator[BenchFrame]:
+    """Every `step`-th image of a bench: from the folder where all are kept there, else rendered and kept."""
     if folder is None:
-        yield from bench.frames()
+        yield from bench.frames(start, None, step)
         return
     settings = bench.settings
     level = "".join(map(str, astuple(settings.hardness)))
     name = f"{level}_{settings.seed}_{settings.travel_direction}_{settings.duration_s:g}_{settings.fps:g}"
+    # The exposure follows from image to image: every fourth one is not a fourth of all.
+    name += f"_{start}_{step}" if (start, step) != (0, 1) else ""
+    name += "_closed" if settings.gap is None else ""
     kept = folder / name
-    files = [kept / f"{index:05d}.npz" for index in range(bench.frame_count)]
+    files = [kept / f"{index:05d}.npz" for index in range(start, bench.frame_count, step)]
     if all(file.exists() for file in files):
         yield from map(_load, files)
         return
     kept.mkdir(parents=True, exist_ok=True)
-    for file, frame in zip(files, bench.frames(), strict=True):
+    for file, frame in zip(files, bench.frames(start, None, step), strict=True):
         _save(file, frame)
         yield frame
 

@@ -13,6 +13,7 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, brightness
 from knee_gap_perception.foreign_bodies import foreign_bodies
 from knee_gap_perception.gap_confidence import gap_confidence
+from knee_gap_perception.gap_evidence import GapEvidence
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
 from knee_gap_perception.poses import LensPose
@@ -71,6 +72,7 @@ class GapEdgeDetector:
         self._pose_frame = ""
         self._reason = "no image was looked at yet"
         self._confidence = float("nan")
+        self._evidence = GapEvidence()
         # OpenCV's threads would fight with the other nodes for a gain of nothing at these sizes.
         cv2.setNumThreads(1)
 
@@ -91,6 +93,8 @@ class GapEdgeDetector:
     def choose_at(self, pixel: npt.ArrayLike) -> None:
         """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
         self._clicked = np.asarray(pixel, dtype=np.float64)
+        # What was seen elsewhere says nothing of this place.
+        self._evidence.forget()
         self.end_track()
 
     def choose_near(self, pixel: npt.ArrayLike, camera: Camera) -> str:
@@ -240,7 +244,7 @@ class GapEdgeDetector:
         field: FieldOfView,
     ) -> list[Sighting]:
         """Find the gap, choose the points and begin a track."""
-        section = self._section(picture, camera, field)
+        section = self._agreed_section(stamp_ns, picture, camera, field)
         coarseness = camera.radians_per_pixel(section.centre)
         points = choose_points(grey, section, field, self.parameters.inset / coarseness)
         if points is None:
@@ -262,6 +266,23 @@ class GapEdgeDetector:
         self._clicked = None
         return [first.first, second.first]
 
+    def _agreed_section(self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView) -> Section:
+        """The section of the gap, if the images just before do not speak against it."""
+        try:
+            section = self._section(picture, camera, field)
+        except _NoPointsError as refusal:
+            if refusal.status is EdgeStatus.NO_GAP:
+                self._evidence.add(stamp_ns, np.nan_to_num(self._confidence))
+            raise
+        confidence = self._evidence.add(stamp_ns, self._confidence)
+        if confidence < self.parameters.minimum_confidence:
+            raise _NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the images just before showed no gap: the confidence of all is {confidence:.2f}, needed is "
+                f"{self.parameters.minimum_confidence:.2f}",
+            )
+        return section
+
     def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:
         """The section of the gap; raises _NoPointsError where the picture shows none."""
         self._confidence = float("nan")
@@ -270,7 +291,7 @@ class GapEdgeDetector:
             (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
         )
         value = brightness(small)
-        self._check_light(value[inside])
+        light = self._check_light(value[inside])
         foreign = foreign_bodies(small)
         dark = self._segmentation(small, inside & ~foreign)
         section = find_section(dark, value, foreign, field, scale, self._region(field))
@@ -285,7 +306,7 @@ class GapEdgeDetector:
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
-        confidence = self._confidence = gap_confidence(section, field.extent, small, dark)
+        confidence = self._confidence = gap_confidence(section, light, small, dark)
         if confidence < self.parameters.minimum_confidence:
             raise _NoPointsError(
                 EdgeStatus.NO_GAP,
@@ -294,11 +315,14 @@ class GapEdgeDetector:
             )
         return section
 
-    def _check_light(self, values: Image) -> None:
-        if values.size == 0 or np.percentile(values, 95) < DARK_PICTURE:
+    def _check_light(self, values: Image) -> float:
+        """Brightness [grey levels] that a twentieth exceeds, if anything can be told in that light."""
+        light = float(np.percentile(values, 95)) if values.size else 0.0
+        if light < DARK_PICTURE:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
         if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
             raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+        return light
 
     def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
         """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.

@@ -11,27 +11,31 @@ Mask = npt.NDArray[np.bool_]
 
 # Logistic regression on sections of simulated knees (levels 0-3, open and closed joints) and of real frames
 # with a cleft (a nose) and without one (a laparoscope's), open and closed weighted alike.
-CONTRAST_WEIGHT = 13.7
-SHARPNESS_WEIGHT = 14.1
-SIZE_WEIGHT = 3.3
-UNEVENNESS_WEIGHT = -14.2
-OFFSET = -6.5
-LEAST_CONTRAST = -0.5  # [-]: what is brighter than its sides by more tells nothing more
-LARGEST_SIZE = 0.3  # [-] radius of the disc against the field's, above which more tells nothing more
+CONTRAST_WEIGHT = 5.5  # of its logarithm: what is no darker than its sides is no gap, however crisp it is
+BLUNT_WEIGHT = 3.9
+SHARP_WEIGHT = 9.4
+LIT_WEIGHT = 17.1
+UNEVENNESS_WEIGHT = -11.1
+OFFSET = -10.0
+LEAST_CONTRAST = 0.05  # [-]: what is brighter than its sides by more tells nothing more
+FULLY_LIT = 0.8  # [-] of the picture's light, above which more tells nothing more
 LEVEL_OFFSET = 5.0  # [grey levels]: the noise of black is no unevenness
 
 
-def gap_confidence(section: Section, field_radius: float, image: Image, dark: Mask) -> float:
+def gap_confidence(section: Section, light: float, image: Image, dark: Mask) -> float:
     """Confidence [0, 1] that a section through dark pixels (h, w) of an image (h, w, 3) is a gap.
 
-    A gap is dark against the tissue on both sides, ends sharply, is open and evenly dark. Shaded tissue is a
-    little darker than its surroundings, ends slowly, is ragged, so that no large disc fits into it, and
-    uneven. `field_radius` [px] is in the pixels of the section.
+    Through an opening one looks past an edge that hides what lies behind: the gap is dark against the tissue
+    on both sides, evenly so, and ends sharply, most of all at the edge that is nearer to the lamp, which is
+    lit in full. A crease under a condyle, where the bone turns away from the lamp, may be darker than a gap,
+    but both its sides sink into shade: they end slowly and are dark themselves. `light` [grey levels] is the
+    brightness of what is lit in full.
     """
     evidence = (
-        CONTRAST_WEIGHT * max(float(section.contrast.min()), LEAST_CONTRAST)
-        + SHARPNESS_WEIGHT * float(section.sharpness.min())
-        + SIZE_WEIGHT * min(section.radius / field_radius, LARGEST_SIZE)
+        CONTRAST_WEIGHT * np.log(max(float(section.contrast.min()), LEAST_CONTRAST))
+        + BLUNT_WEIGHT * float(section.sharpness.min())
+        + SHARP_WEIGHT * float(section.sharpness.max())
+        + LIT_WEIGHT * min(float(section.levels[1:].max()) / light, FULLY_LIT)
         + UNEVENNESS_WEIGHT * unevenness(image, dark)
         + OFFSET
     )

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_perception.border_sharpness import border_sharpness
 from knee_gap_perception.field_of_view import FieldOfView
 
 Array = npt.NDArray[np.float64]
@@ -17,10 +18,6 @@ SMOOTHED = 4  # directions to either side over which widths are levelled
 STEP = 0.5  # [px at working size] between the samples of a ray
 TISSUE_BEYOND = 6  # [px at working size] of tissue that must follow an edge
 CANDIDATES = 4  # dark parts looked at, largest first
-AROUND = 10  # [px at working size] to either side of an edge in which its sharpness is judged
-LINES = np.linspace(-6.0, 6.0, 7)  # [px at working size] along the edge, on which it is judged
-SHARP = 3  # [px at working size] over which a sharp edge rises
-LEAST_RANGE = 4.0  # [grey levels]: noise is no edge
 
 
 @dataclass(frozen=True)
@@ -28,8 +25,8 @@ class Section:
     """The largest inscribed disc (centre [px], radius [px]) and the two edges across it (2, 2) [px].
 
     `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,)
-    the step over each edge against the tissue's; `sharpness` (2,) the share of the rise around each edge that
-    falls within a few pixels: shade ends slowly. Lengths are in pixels of the full image.
+    the step over each edge against the tissue's; `sharpness` (2,) that of the border on either side
+    (`border_sharpness`). Lengths are in pixels of the full image.
     """
 
     centre: Array
@@ -130,7 +127,7 @@ def _section_through(
         edges=(ends + 0.5) / scale - 0.5,
         contrast=contrast,
         levels=levels,
-        sharpness=_sharpness(centre, ends, value),
+        sharpness=border_sharpness(part, centre, directions[narrowest], value, foreign, field, scale),
     )
 
 
@@ -143,23 +140,6 @@ def _smoothed(width: Array) -> Array:
     known = np.isfinite(turns)
     level = np.where(known, turns, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(np.isfinite(width), level, np.nan)
-
-
-def _sharpness(centre: Array, ends: Array, value: Image) -> Array:
-    """Largest rise outwards over SHARP pixels against the range around each end (2, 2), median of lines."""
-    smooth = cv2.GaussianBlur(value, (0, 0), 1.0).astype(np.float32)
-    outward = (ends - centre) / np.linalg.norm(ends - centre, axis=1, keepdims=True)
-    along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
-    steps = np.arange(-AROUND, AROUND + 1)
-    places = (
-        ends[:, None, None]
-        + LINES[:, None, None] * along[:, None, None]
-        + steps[:, None] * outward[:, None, None]
-    ).astype(np.float32)
-    flat = places.reshape(-1, len(steps), 2)
-    lines = cv2.remap(smooth, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(2, len(LINES), -1)
-    rise = (lines[..., SHARP:] - lines[..., :-SHARP]).max(axis=-1)
-    return np.asarray(np.median(rise / np.maximum(np.ptp(lines, axis=-1), LEAST_RANGE), axis=-1))
 
 
 def _levels(centre: Array, radius: float, ends: Array, value: Image) -> Array:
