@@ -40,6 +40,7 @@ Mask = npt.NDArray[np.bool_]
 STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese")
 NEEDED = (0.97, 0.96, 0.94, 0.88)
 BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+GOLDEN = 0.618034  # [-] the multiples of which spread evenly
 SHADES = ((1.0, 0.0), (0.5, 0.0), (0.5, 0.7), (0.25, 0.7))  # gain, and how much of it is lost at the rim
 
 
@@ -177,7 +178,9 @@ def rendered_one(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
     step = max(1, bench.frame_count // asked.frames)
-    for frame in frames_of(bench, asked.keep, step // 2, step):
+    # Where the lens begins its travel a joint looks other than in the middle: every seed has its own places.
+    start = int(step * (seed * GOLDEN % 1.0)) if asked.decision else step // 2
+    for frame in frames_of(bench, asked.keep, start, step):
         yield frame, camera
 
 

@@ -306,7 +306,7 @@ class GapEdgeDetector:
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
-        confidence = self._confidence = gap_confidence(section, light, small, dark)
+        confidence = self._confidence = gap_confidence(section, field.extent, light, small, dark)
         if confidence < self.parameters.minimum_confidence:
             raise _NoPointsError(
                 EdgeStatus.NO_GAP,
