@@ -70,8 +70,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         choices=("open", "closed"),
         help="no Dice, only decisions, on such joints",
     )
+    parser.add_argument(
+        "--at", type=float, help="share of the travel at which they are looked at; else each seed has its own"
+    )
     parser.add_argument("--pictures", type=Path, help="folder for pictures of wrong decisions")
     asked = parser.parse_args(argv)
+    if asked.at is not None and not 0.0 <= asked.at < 1.0:
+        parser.error(f"--at must lie in [0, 1), not {asked.at:g}")
     judged = decisions(asked) if asked.decision else scores_and_decisions(asked)
     for path in asked.real:
         frames = [judge_real(picture) for picture in pictures(path)]
@@ -179,7 +184,8 @@ def rendered_one(
     )
     step = max(1, bench.frame_count // asked.frames)
     # Where the lens begins its travel a joint looks other than in the middle: every seed has its own places.
-    start = int(step * (seed * GOLDEN % 1.0)) if asked.decision else step // 2
+    place = asked.at if asked.at is not None else seed * GOLDEN % 1.0
+    start = int(step * (place if asked.decision else 0.5))
     for frame in frames_of(bench, asked.keep, start, step):
         yield frame, camera
 

@@ -60,7 +60,7 @@ class EdgeParameters:
         },
     )
     minimum_confidence: float = field(
-        default=0.5,
+        default=0.4,
         metadata={
             "description": "Confidence that a dark part is a gap, below which it is taken for shade [-]",
             "range": (0.0, 1.0),
