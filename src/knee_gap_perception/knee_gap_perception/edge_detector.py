@@ -245,8 +245,9 @@ class GapEdgeDetector:
     ) -> list[Sighting]:
         """Find the gap, choose the points and begin a track."""
         section = self._agreed_section(stamp_ns, picture, camera, field)
-        coarseness = camera.radians_per_pixel(section.centre)
-        points = choose_points(grey, section, field, self.parameters.inset / coarseness)
+        inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
+        small, scale = self._working_size(picture)
+        points = choose_points(grey, section, field, inset_px, foreign_bodies(small), scale)
         if points is None:
             raise _NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"

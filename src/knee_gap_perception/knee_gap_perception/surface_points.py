@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -13,12 +14,14 @@ from knee_gap_perception.section import Section
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 EDGE_SEARCH = 32  # [px] within which the edge of the section is refined in the full image
 ALONG = (-48, -36, -24, -12, 0, 12, 24, 36, 48)  # [px] along the edge from the section
 INSETS = (0.75, 1.0, 1.25)  # of the inset that is asked for
 PATCH_HALF = 24  # [px] half side of the piece of tissue that is judged
 MINIMUM_TISSUE = 0.4  # share of that piece that must be tissue without highlight
+AWAY = 8  # [px at working size] from instruments and glare
 MOST_OF_A_BLOCK = (
     1.5  # of the median block's texture that one block counts: drifting debris is texture as well
 )
@@ -42,13 +45,15 @@ class SurfacePoint:
 
 
 def choose_points(
-    grey: Image, section: Section, field: FieldOfView, inset_px: float
+    grey: Image, section: Section, field: FieldOfView, inset_px: float, foreign: Mask, scale: float
 ) -> list[SurfacePoint] | None:
     """The two points beside a section's edges, `inset_px` inside the tissue; None where a side has none.
 
     Near the section, and a little nearer to or farther from the edge, the place with the strongest texture
-    and without highlight is taken: the texture is what the point is followed by.
+    and without highlight is taken: the texture is what the point is followed by. `foreign` (h, w) is where
+    the picture, made smaller by `scale`, shows what is no tissue; no place beside it is taken.
     """
+    near = cv2.dilate(foreign.astype(np.uint8), np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)) > 0
     gap = _level(grey, section.centre)
     chosen = []
     for index, sign in enumerate((-1.0, 1.0)):
@@ -68,7 +73,8 @@ def choose_points(
                 places = [edge + share * inset_px * outward for share in INSETS]
                 candidates += [_judge(grey, place, dark_below, shift, edge, outward) for place in places]
         usable = [point for point in candidates if field.depth_inside(point.pixel) > 2 * PATCH_HALF]
-        # Where nothing ends, what looks like the surface's texture may be another one behind it.
+        usable = [point for point in usable if _is_clear(point.pixel, near, scale)]
+        # Where no surface ends, what looks like the texture of one may be that of another behind it.
         best = max(
             usable, key=lambda point: (point.kind is not EdgeKind.SHADING, point.texture), default=None
         )
@@ -76,6 +82,12 @@ def choose_points(
             return None
         chosen.append(best)
     return chosen
+
+
+def _is_clear(pixel: Array, near: Mask, scale: float) -> bool:
+    """Whether a pixel (2,) lies apart from what is no tissue: a probe has more texture than any tissue."""
+    column, row = np.rint(scale * pixel).astype(int)
+    return not near[min(row, near.shape[0] - 1), min(column, near.shape[1] - 1)]
 
 
 def _level(grey: Image, pixel: Array) -> float:
