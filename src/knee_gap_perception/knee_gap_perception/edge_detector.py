@@ -10,32 +10,16 @@ from knee_gap_perception.camera import Camera, bearing_jacobian
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, brightness
+from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder
 from knee_gap_perception.foreign_bodies import foreign_bodies
-from knee_gap_perception.gap_confidence import gap_confidence
-from knee_gap_perception.gap_evidence import GapEvidence
+from knee_gap_perception.gap_search import GapSearch, NoPointsError, check_light
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
 from knee_gap_perception.poses import LensPose
-from knee_gap_perception.section import Section, find_section
-from knee_gap_perception.segmentation.choice import segmentation_named
 from knee_gap_perception.surface_points import choose_points
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
-
-DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
-BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
-OVEREXPOSED_SHARE = 0.7  # of the field
-
-
-class _NoPointsError(Exception):
-    """Why an image gives no points."""
-
-    def __init__(self, status: EdgeStatus, reason: str) -> None:
-        super().__init__(reason)
-        self.status = status
 
 
 @dataclass(frozen=True)
@@ -59,7 +43,7 @@ class GapEdgeDetector:
     def __init__(self, parameters: EdgeParameters | None = None) -> None:
         """Raises PerceptionError where the segmentation cannot be had (a network that cannot be read)."""
         self.parameters = parameters or EdgeParameters()
-        self._segmentation = segmentation_named(self.parameters.segmentation, **_settings(self.parameters))
+        self._search = GapSearch(self.parameters)
         self._finder = FieldOfViewFinder()
         self._track: _Track | None = None
         self._tracks = 0
@@ -71,8 +55,6 @@ class GapEdgeDetector:
         self._clicked: Array | None = None
         self._pose_frame = ""
         self._reason = "no image was looked at yet"
-        self._confidence = float("nan")
-        self._evidence = GapEvidence()
         # OpenCV's threads would fight with the other nodes for a gain of nothing at these sizes.
         cv2.setNumThreads(1)
 
@@ -84,7 +66,7 @@ class GapEdgeDetector:
     @property
     def confidence(self) -> float:
         """Confidence [0, 1] of the last search that its dark part is a gap; NaN where it found none."""
-        return self._confidence
+        return self._search.confidence
 
     def end_track(self) -> None:
         """Forget the points; the next image starts a new track."""
@@ -94,14 +76,14 @@ class GapEdgeDetector:
         """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
         self._clicked = np.asarray(pixel, dtype=np.float64)
         # What was seen elsewhere says nothing of this place.
-        self._evidence.forget()
+        self._search.forget()
         self.end_track()
 
     def choose_near(self, pixel: npt.ArrayLike, camera: Camera) -> str:
         """As `choose_at`, if the last image shows a gap there; otherwise nothing changes, and it says why."""
         if self._image is None:
             return "no image received yet"
-        clicked, before = np.asarray(pixel, dtype=np.float64), self._clicked
+        clicked = np.asarray(pixel, dtype=np.float64)
         height, width = self._image.shape[:2]
         if not (np.isfinite(clicked).all() and (clicked >= -0.5).all() and (clicked < [width, height]).all()):
             place = f"{clicked[0]:g}, {clicked[1]:g}"
@@ -109,11 +91,9 @@ class GapEdgeDetector:
         field = self._finder.find(self._image)
         if field is None or field.depth_inside(clicked) <= 0:
             return "the point lies outside the field of view"
-        self._clicked = clicked
         try:
-            self._section(self._image, camera, field)
-        except (_NoPointsError, PerceptionError) as refusal:
-            self._clicked = before
+            self._search.section(self._image, camera, field, clicked)
+        except (NoPointsError, PerceptionError) as refusal:
             return str(refusal)
         self.choose_at(clicked)
         return ""
@@ -138,7 +118,7 @@ class GapEdgeDetector:
                 self._settle_frame(lens_pose.frame_id)
             edges = self._points(stamp_ns, picture, camera, view, frame_id)
             self._reason = ""
-        except _NoPointsError as refusal:
+        except NoPointsError as refusal:
             self._reason = str(refusal)
             track_id = self._track.track_id if self._track is not None else 0
             edges = GapEdges.without_points(stamp_ns, frame_id, refusal.status, track_id)
@@ -152,15 +132,10 @@ class GapEdgeDetector:
         image = self._image if image is None else image
         if image is None:
             return np.zeros((0, 0), np.uint8)
-        shape = image.shape[:2]
         field = self._finder.find(image)
         if field is None:
-            return np.zeros(shape, np.uint8)
-        small, scale = self._working_size(image)
-        inside = field.mask((small.shape[0], small.shape[1]), scale)
-        dark = self._segmentation(small, inside & ~foreign_bodies(small))
-        full = cv2.resize(dark.astype(np.uint8) * 255, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-        return np.where(full > 127, 255, 0).astype(np.uint8)
+            return np.zeros(image.shape[:2], np.uint8)
+        return self._search.mask(image, field)
 
     def _checked(self, stamp_ns: int, image: Image, camera: Camera) -> Image:
         """The image as blue, green, red, if it and its stamp can be used at all."""
@@ -191,7 +166,7 @@ class GapEdgeDetector:
         return picture
 
     def _refuse(self, reason: str) -> None:
-        raise _NoPointsError(EdgeStatus.UNKNOWN, reason)
+        raise NoPointsError(EdgeStatus.UNKNOWN, reason)
 
     def _check_frozen(self, picture: Image) -> None:
         # Noise makes every image of a live camera differ, even of a scene that does not move.
@@ -200,7 +175,7 @@ class GapEdgeDetector:
         self._thumbnail = thumbnail
         self._identical = self._identical + 1 if same else 0
         if self._identical + 1 >= self.parameters.frozen_images:
-            raise _NoPointsError(
+            raise NoPointsError(
                 EdgeStatus.UNKNOWN, f"the video is frozen: {self._identical + 1} identical images"
             )
 
@@ -210,7 +185,7 @@ class GapEdgeDetector:
         field = self._finder.find(picture)
         if field is None:
             self.end_track()
-            raise _NoPointsError(
+            raise NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "the picture is too dark to find the field of view in"
             )
         grey = np.asarray(cv2.extractChannel(picture, 1), np.uint8)
@@ -244,12 +219,12 @@ class GapEdgeDetector:
         field: FieldOfView,
     ) -> list[Sighting]:
         """Find the gap, choose the points and begin a track."""
-        section = self._agreed_section(stamp_ns, picture, camera, field)
+        section = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
         inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
-        small, scale = self._working_size(picture)
+        small, scale = self._search.smaller(picture)
         points = choose_points(grey, section, field, inset_px, foreign_bodies(small), scale)
         if points is None:
-            raise _NoPointsError(
+            raise NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
             )
         first, second = (
@@ -267,64 +242,6 @@ class GapEdgeDetector:
         self._clicked = None
         return [first.first, second.first]
 
-    def _agreed_section(self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView) -> Section:
-        """The section of the gap, if the images just before do not speak against it."""
-        try:
-            section = self._section(picture, camera, field)
-        except _NoPointsError as refusal:
-            if refusal.status is EdgeStatus.NO_GAP:
-                self._evidence.add(stamp_ns, np.nan_to_num(self._confidence))
-            raise
-        confidence = self._evidence.add(stamp_ns, self._confidence)
-        if confidence < self.parameters.minimum_confidence:
-            raise _NoPointsError(
-                EdgeStatus.NO_GAP,
-                f"the images just before showed no gap: the confidence of all is {confidence:.2f}, needed is "
-                f"{self.parameters.minimum_confidence:.2f}",
-            )
-        return section
-
-    def _section(self, picture: Image, camera: Camera, field: FieldOfView) -> Section:
-        """The section of the gap; raises _NoPointsError where the picture shows none."""
-        self._confidence = float("nan")
-        small, scale = self._working_size(picture)
-        inside = field.mask(
-            (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
-        )
-        value = brightness(small)
-        light = self._check_light(value[inside])
-        foreign = foreign_bodies(small)
-        dark = self._segmentation(small, inside & ~foreign)
-        section = find_section(dark, value, foreign, field, scale, self._region(field))
-        if section is None:
-            raise _NoPointsError(
-                EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
-            )
-        width = float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
-        if not width >= self.parameters.minimum_width:
-            raise _NoPointsError(
-                EdgeStatus.NO_GAP,
-                f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
-                f"{np.degrees(self.parameters.minimum_width):.1f} deg",
-            )
-        confidence = self._confidence = gap_confidence(section, field.extent, light, small, dark)
-        if confidence < self.parameters.minimum_confidence:
-            raise _NoPointsError(
-                EdgeStatus.NO_GAP,
-                f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
-                f"{self.parameters.minimum_confidence:.2f}",
-            )
-        return section
-
-    def _check_light(self, values: Image) -> float:
-        """Brightness [grey levels] that a twentieth exceeds, if anything can be told in that light."""
-        light = float(np.percentile(values, 95)) if values.size else 0.0
-        if light < DARK_PICTURE:
-            raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
-        if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
-            raise _NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
-        return light
-
     def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
         """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.
 
@@ -333,24 +250,11 @@ class GapEdgeDetector:
         rows, columns = np.mgrid[8 : picture.shape[0] : 16, 8 : picture.shape[1] : 16]
         inside = field.depth_inside(np.stack([columns, rows], axis=-1)) > 0
         try:
-            self._check_light(picture[8::16, 8::16].max(axis=2)[inside])
-        except _NoPointsError:
+            check_light(picture[8::16, 8::16].max(axis=2)[inside])
+        except NoPointsError:
             if stamp_ns - self._seen_ns > 1e9 * self.parameters.maximum_unseen:
                 self.end_track()
             raise
-
-    def _region(self, field: FieldOfView) -> tuple[Array, float]:
-        """Centre and radius [px] of the region of interest."""
-        radius = self.parameters.region_radius * field.extent
-        if self._clicked is not None:
-            return self._clicked, min(radius, 0.2 * field.extent)
-        centre = np.array(self.parameters.region_centre)
-        return np.where(np.isnan(centre), np.array(field.centre), centre), radius
-
-    def _working_size(self, picture: Image) -> tuple[Image, float]:
-        scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
-        size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
-        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
     def _follow(
         self, stamp_ns: int, grey: Image, camera: Camera, view: View | None, field: FieldOfView
@@ -367,12 +271,12 @@ class GapEdgeDetector:
             raise self._ended(EdgeStatus.LOW_CONTRAST, "a point was hidden for too long")
         return sightings
 
-    def _ended(self, status: EdgeStatus, reason: str) -> _NoPointsError:
+    def _ended(self, status: EdgeStatus, reason: str) -> NoPointsError:
         self.end_track()
-        return _NoPointsError(status, reason)
+        return NoPointsError(status, reason)
 
     def _edges(self, stamp_ns: int, frame_id: str, camera: Camera, sightings: list[Sighting]) -> GapEdges:
-        """The message's values; raises _NoPointsError where the points are not known well enough."""
+        """The message's values; raises NoPointsError where the points are not known well enough."""
         assert self._track is not None
         pixels = np.stack([sighting.position for sighting in sightings])
         bearings = camera.bearings(pixels)
@@ -388,7 +292,7 @@ class GapEdgeDetector:
         worst = max(float(np.linalg.eigvalsh(covariance)[-1]) for covariance in covariances)
         angular_error = self.parameters.error_factor * float(np.sqrt(worst))
         if angular_error > self.parameters.maximum_angular_error:
-            raise _NoPointsError(
+            raise NoPointsError(
                 EdgeStatus.LOW_CONTRAST,
                 f"a point is known to {np.degrees(angular_error):.2f} deg only, needed are "
                 f"{np.degrees(self.parameters.maximum_angular_error):.2f} deg",
@@ -404,15 +308,3 @@ class GapEdgeDetector:
             covariances=covariances,
             angular_error=angular_error,
         )
-
-
-def _settings(parameters: EdgeParameters) -> dict[str, object]:
-    """Settings of the segmentation that the parameters name."""
-    if parameters.segmentation != "onnx":
-        return {}
-    return {
-        "path": parameters.network_path,
-        "input_size": parameters.network_input_size,
-        "mean": parameters.network_mean,
-        "scale": parameters.network_scale,
-    }
