@@ -27,13 +27,17 @@ class Command(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What the controller looks at in a GapEstimate; lengths [m], `age` [s] by its stamp."""
+    """What the controller looks at in a GapEstimate; lengths [m], `age` [s] by its stamp.
+
+    `is_blind`: points or lens are not seen, or nothing can be told of them.
+    """
 
     is_valid: bool
     track_id: int
     age: float
     gap_min: float
     gap_max: float
+    is_blind: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,18 +108,20 @@ class LegControl:
         # Until when the leg opens, and until when it comes to rest; None where it is at rest.
         self._opens_until: float | None = None
         self._rests_from: float | None = None
+        self._latest_track = 0
         self._spent_track: int | None = None
 
     def on_estimate(self, estimate: Estimate, now: float) -> Command:
         """Command at a time `now` [s] that never runs backwards."""
+        self._latest_track = estimate.track_id or self._latest_track
         if self._opens_until is not None:
-            if now < self._opens_until:
+            if now < self._opens_until and not estimate.is_blind:
                 return Command(Action.OPEN, self.parameters.opening_rate, "a step")
             self._stop(now)
         if self._rests_from is not None:
             if now < self._rests_from:
                 return Command(Action.HOLD, 0.0, "the leg comes to rest")
-            self._rests_from, self._spent_track = None, estimate.track_id
+            self._rests_from, self._spent_track = None, self._latest_track
             return Command(Action.HOLD, 0.0, "the joint has moved: it is measured anew", measure_anew=True)
         if estimate.track_id == self._spent_track:
             return Command(Action.HOLD, 0.0, "the joint has moved since this track began")

@@ -14,6 +14,14 @@ from knee_gap_bringup.leg_control import Action, Command, Estimate, LegControl, 
 from knee_gap_msgs.msg import GapEstimate
 from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
 
+# What is said where points or lens are not seen; a leg that opens is known to move, and may well go on.
+BLIND = (
+    GapEstimate.STATUS_UNKNOWN,
+    GapEstimate.STATUS_NO_EDGES,
+    GapEstimate.STATUS_TRACKING_LOST,
+    GapEstimate.STATUS_OUT_OF_SYNC,
+)
+
 
 class LegControllerNode(BaseNode):
     """Converts, decides, publishes the rate at which the joint should open [m/s]."""
@@ -42,7 +50,8 @@ class LegControllerNode(BaseNode):
         """Decide on one estimate."""
         valid = message.status == GapEstimate.STATUS_VALID
         age = (self.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds / 1e9
-        estimate = Estimate(valid, message.track_id, age, message.gap_min, message.gap_max)
+        blind = message.status in BLIND
+        estimate = Estimate(valid, message.track_id, age, message.gap_min, message.gap_max, blind)
         self.command(self._control.on_estimate(estimate, time.monotonic()))
 
     def on_silence(self, _event: object) -> None:

@@ -20,7 +20,18 @@ from launch_ros.actions import Node
 
 SHARE = Path(get_package_share_directory("knee_gap_bringup"))
 INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
-OUTPUTS = ("gap_edges", "scope_pose", "scope_calibration", "gap", "gap/min", "gap/max", "gap/snr")
+OUTPUTS = (
+    "gap_edges",
+    "scope_pose",
+    "scope_turn",
+    "scope_notch",
+    "scope_calibration",
+    "gap",
+    "gap/min",
+    "gap/max",
+    "gap/snr",
+    "motion_advice",
+)
 # Time for the last image to pass through the nodes [s].
 DRAIN = 1.0
 

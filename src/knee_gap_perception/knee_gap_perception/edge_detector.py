@@ -40,13 +40,16 @@ class GapEdgeDetector:
     raises: a status and `reason` tell what was wrong with it.
     """
 
-    def __init__(self, parameters: EdgeParameters | None = None) -> None:
-        """Raises PerceptionError where the segmentation cannot be had (a network that cannot be read)."""
+    def __init__(self, parameters: EdgeParameters | None = None, first_track_id: int = 1) -> None:
+        """Tracks are numbered from `first_track_id` on.
+
+        Raises PerceptionError where the segmentation cannot be had (a network that cannot be read).
+        """
         self.parameters = parameters or EdgeParameters()
         self._search = GapSearch(self.parameters)
         self._finder = FieldOfViewFinder()
         self._track: _Track | None = None
-        self._tracks = 0
+        self._next_track_id = first_track_id
         self._seen_ns = 0
         self._stamp_ns: int | None = None
         self._image: Image | None = None
@@ -71,6 +74,12 @@ class GapEdgeDetector:
     def end_track(self) -> None:
         """Forget the points; the next image starts a new track."""
         self._track = None
+
+    def start_anew(self) -> None:
+        """Forget the points, what was clicked, and what earlier images said of a gap."""
+        self._clicked = None
+        self._search.forget()
+        self.end_track()
 
     def choose_at(self, pixel: npt.ArrayLike) -> None:
         """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
@@ -152,11 +161,10 @@ class GapEdgeDetector:
                 f"the image has {image.shape[1]}x{image.shape[0]} px"
             )
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            backwards = self._stamp_ns - stamp_ns
-            self.end_track()
-            self._stamp_ns = stamp_ns
-            if not backwards:
+            # An image that comes twice tells nothing; stamps that run backwards are another recording.
+            if stamp_ns == self._stamp_ns:
                 self._refuse("the image has the stamp of the one before")
+            self.end_track()
         self._stamp_ns = stamp_ns
         picture = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
         if self._image is not None and self._image.shape != picture.shape:
@@ -230,15 +238,15 @@ class GapEdgeDetector:
         first, second = (
             PointTrack(grey, point.pixel, point.dark_below, camera, view, point.kind) for point in points
         )
-        self._tracks += 1
         self._seen_ns = stamp_ns
         self._track = _Track(
-            self._tracks,
+            self._next_track_id,
             (first, second),
             (points[0].kind, points[1].kind),
             self._pose_frame if view is not None else None,
             self._clicked,
         )
+        self._next_track_id += 1
         self._clicked = None
         return [first.first, second.first]
 

@@ -58,6 +58,7 @@ class EdgeStream:
     Images are handed in by `on_image` and come out, in order, as edges from `ready`. With a `calibration` the
     camera is its own, whatever camera_info says, and images of another size are refused. `by_notch`: the
     notch is looked for in every image as it arrives, and there is one lens pose an image, which rests on it.
+    Tracks are numbered from `first_track_id` on.
     Raises PerceptionError for a calibration without a camera, or without the notch that is to be found.
     """
 
@@ -68,8 +69,9 @@ class EdgeStream:
         calibration: Calibration | None = None,
         *,
         by_notch: bool = False,
+        first_track_id: int = 1,
     ) -> None:
-        self.detector = GapEdgeDetector(parameters)
+        self.detector = GapEdgeDetector(parameters, first_track_id)
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
         self.reason = "no image received yet"

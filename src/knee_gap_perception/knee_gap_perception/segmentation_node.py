@@ -1,6 +1,7 @@
 """segmentation_node: images of the scope in; gap_edges, the two points beside the gap, out."""
 
 from collections.abc import Mapping, Sequence
+from time import time
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,13 @@ class SegmentationNode(BaseNode):
         edges, calibration = self.declare(EdgeParameters), self.declare(CalibrationParameters)
         self.refuse_unknown_parameters()
         try:
-            self._stream = EdgeStream(edges, poses, calibration.load(), by_notch=calibration.scope_turn_notch)
+            self._stream = EdgeStream(
+                edges,
+                poses,
+                calibration.load(),
+                by_notch=calibration.scope_turn_notch,
+                first_track_id=unused_track_id(),
+            )
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
         # Compiled before the first image, so that its answer is not late.
@@ -110,10 +117,9 @@ class SegmentationNode(BaseNode):
         return int(self.get_clock().now().nanoseconds)
 
     def on_click(self, message: PointStamped) -> None:
-        """Choose the section of the gap nearest to a pixel (x column, y row) of the next image."""
-        clicked = np.array([message.point.x, message.point.y])
-        if np.isfinite(clicked).all():
-            self._stream.detector.choose_at(clicked)
+        """As `choose_point`, for a pixel x column, y row; a refusal is told in the log."""
+        if reason := self._stream.choose(message.point.x, message.point.y):
+            self.get_logger().warning(f"clicked_point is not followed: {reason}")
 
     def on_choose(self, request: ChoosePoint.Request, answer: ChoosePoint.Response) -> ChoosePoint.Response:
         """Choose the section nearest to a pixel, if the latest image shows a gap there."""
@@ -123,7 +129,7 @@ class SegmentationNode(BaseNode):
 
     def on_start_anew(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """End the track; the next image that shows a gap begins a new one."""
-        self._stream.detector.end_track()
+        self._stream.detector.start_anew()
         answer.success, answer.message = True, "the next image that shows a gap begins a new track"
         return answer
 
@@ -156,6 +162,14 @@ class SegmentationNode(BaseNode):
         counts["last refusal"] = self._stream.last_refusal
         counts["confidence of the last search"] = self._stream.detector.confidence
         return well, self._stream.reason, {"calibration": hash_or_none(self._stream.calibration), **counts}
+
+
+def unused_track_id() -> int:
+    """First number of this process's tracks: whoever hears them shall not take them for those of one before.
+
+    A thousand for each second, from 1 to 4e9.
+    """
+    return 1 + 1000 * (int(time()) % 4_000_000)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

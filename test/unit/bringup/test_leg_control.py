@@ -74,3 +74,21 @@ def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
     assert control.on_estimate(NARROW, 0.3).action is Action.HOLD
     assert control.on_estimate(NARROW, 0.6).measure_anew
     assert control.on_estimate(NARROW, 0.7).action is Action.HOLD
+
+
+def test_a_step_ends_where_nothing_is_seen_any_more() -> None:
+    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
+    moved = NARROW._replace(is_valid=False)
+    assert control.on_estimate(moved, 0.1).opening_rate > 0.0
+    assert control.on_estimate(moved._replace(is_blind=True), 0.2).opening_rate == 0.0
+    assert control.on_estimate(NARROW, 0.3).action is Action.HOLD
+
+
+def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
+    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
+    assert control.on_estimate(NARROW, 0.1).action is Action.HOLD
+    silent = NARROW._replace(is_valid=False, track_id=0, is_blind=True)
+    assert control.on_estimate(silent, 0.5).measure_anew
+    assert control.on_estimate(NARROW, 0.6).action is Action.HOLD

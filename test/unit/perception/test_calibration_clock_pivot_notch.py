@@ -82,6 +82,14 @@ def test_an_offset_beyond_the_search_is_refused() -> None:
         estimate_time_offset(flow(0.12), track(), max_offset=0.12)
 
 
+def test_time_offset_of_motion_in_bursts_that_fill_windows_at_one_phase_only() -> None:
+    moving = flow(0.01, seconds=44)
+    burst = (moving.start_ns - moving.start_ns[0]) % int(4e9) < int(1.5e9)
+    pairs = ImageMotion(moving.start_ns[burst], moving.end_ns[burst], moving.flow[burst])
+    found = estimate_time_offset(pairs, track(seconds=60), max_offset=0.05)
+    assert abs(found.offset - 0.01) < 4 * found.sigma
+
+
 def test_image_motion_of_a_known_affine_map() -> None:
     rng = np.random.default_rng(3)
     texture = cv2.GaussianBlur(rng.uniform(0, 255, (720, 1280)).astype(np.float32), (0, 0), 3)

@@ -155,9 +155,23 @@ def test_stamps_running_backwards_start_a_new_track(joint: Any, travel: Travel) 
     assert detector.process(11 * FRAME_NS, travel[1][1], joint.camera).track_id == 1
     looped = detector.process(10 * FRAME_NS, travel[1][0], joint.camera)
     assert (looped.status, looped.track_id) == (EdgeStatus.VALID, 2)
-    repeated = detector.process(10 * FRAME_NS, travel[1][1], joint.camera)
+
+
+def test_an_image_that_comes_twice_is_told_and_does_not_end_the_track(joint: Any, travel: Travel) -> None:
+    detector = GapEdgeDetector(first_track_id=7001)
+    assert detector.process(10 * FRAME_NS, travel[1][0], joint.camera).track_id == 7001
+    repeated = detector.process(10 * FRAME_NS, travel[1][0], joint.camera)
     assert repeated.status is EdgeStatus.UNKNOWN
     assert "stamp" in detector.reason
+    assert detector.process(11 * FRAME_NS, travel[1][1], joint.camera).track_id == 7001
+
+
+def test_starting_anew_forgets_a_click_where_no_gap_is(joint: Any, travel: Travel) -> None:
+    detector = GapEdgeDetector()
+    detector.choose_at([200.0, 40.0])
+    assert detector.process(10 * FRAME_NS, travel[1][0], joint.camera).status is not EdgeStatus.VALID
+    detector.start_anew()
+    assert detector.process(11 * FRAME_NS, travel[1][1], joint.camera).status is EdgeStatus.VALID
 
 
 def test_a_clicked_pixel_chooses_the_section(joint: Any, travel: Travel) -> None:

@@ -93,13 +93,17 @@ def estimate_time_offset(motion: ImageMotion, track: PoseTrack, *, max_offset: f
         )
     offsets, variances = [], []
     for degree, phase in product(DEGREES, PHASES):
-        one = replace(residuals, degree=degree, windows=_windows(pairs, phase))
+        windows = _windows(pairs, phase)
+        # Motion in short bursts may fill windows at one phase only.
+        if len(windows) < MIN_WINDOWS:
+            continue
+        one = replace(residuals, degree=degree, windows=windows)
         offsets.append(_minimum(one, float(steps[best])))
         variances.append(one.variance(offsets[-1]))
     offset = float(np.mean(offsets))
     sigma = float(np.sqrt(np.mean(variances) + np.var(offsets)))
     explained = 1 - float(residuals(offset).sum()) / residuals.total
-    return TimeOffset(offset, sigma, explained, len(windows), np.column_stack([steps, scan]))
+    return TimeOffset(offset, sigma, explained, len(residuals.windows), np.column_stack([steps, scan]))
 
 
 def _windows(pairs: ImageMotion, phase: float) -> list[npt.NDArray[np.intp]]:
