@@ -21,7 +21,7 @@ ALONG = (-48, -36, -24, -12, 0, 12, 24, 36, 48)  # [px] along the edge from the 
 INSETS = (0.75, 1.0, 1.25)  # of the inset that is asked for
 PATCH_HALF = 24  # [px] half side of the piece of tissue that is judged
 MINIMUM_TISSUE = 0.4  # share of that piece that must be tissue without highlight
-AWAY = 8  # [px at working size] from instruments and glare
+AWAY = 12  # [px at working size] from instruments and glare: half of what a point is followed by
 MOST_OF_A_BLOCK = (
     1.5  # of the median block's texture that one block counts: drifting debris is texture as well
 )
