@@ -45,12 +45,16 @@ def fill_lens_transform(message: Any, lens: LensPose) -> Any:
     return message
 
 
-def fill_scope_calibration(message: Any, node: str, calibration: Calibration | None) -> Any:
+def fill_scope_calibration(
+    message: Any, node: str, calibration: Calibration | None, *, turn_followed: bool = False
+) -> Any:
     """Set every field of a knee_gap_msgs/ScopeCalibration; returns the message.
 
-    `node` is who says it. Only tracking_node uses the lens on the body and the clock.
+    `node` is who says it. Only tracking_node uses the lens on the body and the clock, and it alone may follow
+    the turn of the scope.
     """
     message.node, message.hash = node, calibration.hash if calibration else ""
+    message.turn_followed = turn_followed
     covariance = np.full((6, 6), np.nan)
     message.time_offset = message.time_offset_error = float("nan")
     if calibration is not None:

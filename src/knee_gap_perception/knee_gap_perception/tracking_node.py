@@ -58,7 +58,12 @@ class TrackingNode(BaseNode):
         if self._tracker.follows_turn:
             self._scope_turn = self.create_publisher(ScopeTurn, "scope_turn", RESULT_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
-        told = fill_scope_calibration(ScopeCalibration(), "tracking_node", self._tracker.calibration)
+        told = fill_scope_calibration(
+            ScopeCalibration(),
+            "tracking_node",
+            self._tracker.calibration,
+            turn_followed=self._tracker.follows_turn,
+        )
         self._calibration.publish(told)
         # Images and what Motive sends come in threads of their own.
         self._one_at_a_time = threading.Lock()

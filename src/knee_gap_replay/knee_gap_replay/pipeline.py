@@ -128,7 +128,12 @@ class GapPipeline:
         # What the nodes say of their calibrations at their start; in a bag only where there is one.
         used = {"segmentation_node": detector.calibration, "tracking_node": tracker.calibration}
         self._calibrations = [
-            fill_scope_calibration(blank("knee_gap_msgs/msg/ScopeCalibration"), node, calibration)
+            fill_scope_calibration(
+                blank("knee_gap_msgs/msg/ScopeCalibration"),
+                node,
+                calibration,
+                turn_followed=node == "tracking_node" and tracker.follows_turn,
+            )
             for node, calibration in used.items()
             if any(used.values())
         ]
@@ -222,7 +227,8 @@ class GapPipeline:
             if self._tracker.follows_turn:
                 turn = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), lens)
                 yield Output(self._topic("scope_turn"), turn, lens.stamp_ns)
-                self._estimator.add_turn(messages.turn_from_message(turn))
+                told = messages.turn_from_message(turn)
+                yield from self._published(self._estimator.add_turn(told, self._now_ns))
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
             estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)

@@ -9,14 +9,17 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from knee_gap_uncertainty.advice_task import PIECES, AdviceTask
+from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.leg_body import LegBody
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
-from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns
+from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns, TurnRefusal
 from knee_gap_uncertainty.track import Track
 
 NANOSECONDS = 1_000_000_000
@@ -24,6 +27,8 @@ NANOSECONDS = 1_000_000_000
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
 LEG_MOVED = "the leg body moved"
+UNKNOWN_MOTION = "the clock is uncertain, and no two lens poses near the image tell how fast the lens moved"
+NO_NUMBERS = "the views, or the calibration's error, cannot be calculated with"
 
 
 # A quarter of a second of a tracker: slow replay, whose stamps fall behind the clock, is no delay.
@@ -56,7 +61,9 @@ class GapEstimator:
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
-        self._turns = ScopeTurns()
+        self._turns = ScopeTurns(self.parameters.max_pose_age)
+        # Whether a turn was ever told: it is followed then, and an image without one is of an unknown scope.
+        self._turn_told = False
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
         self._leg = LegBody(self.parameters.max_pose_age) if self.parameters.leg_motion > 0.0 else None
@@ -84,13 +91,22 @@ class GapEstimator:
         if refusal is not None:
             self.counts[f"pose refused: {refusal.value}"] += 1
         else:
+            if pose.frame_id != self._frame_id:
+                self._turns.forget_before(pose.stamp_ns)
             self._frame_id = pose.frame_id
             self._pose_delays_ns.append(arrival_ns - queued_ns - pose.stamp_ns)
         return self._resolve(arrival_ns)
 
-    def add_turn(self, told: ScopeTurn) -> None:
-        """Take how far the scope is turned in its camera head, before the pose of the same stamp."""
-        self._turns.add(told)
+    def add_turn(self, told: ScopeTurn, arrival_ns: int) -> list[GapEstimate]:
+        """Take how far the scope is turned in its camera head; return the estimates that it made possible."""
+        self._turn_clock(arrival_ns)
+        if not self._turn_is_followed():
+            # The views before had none.
+            self._track = None
+        self._turn_told = True
+        if refusal := self._turns.add(told):
+            self.counts[f"scope_turn refused: {refusal.value}"] += 1
+        return self._resolve(arrival_ns)
 
     def add_leg_pose(self, pose: LensPose) -> None:
         """Take a pose of the leg body; it is without effect where `leg_motion` is 0."""
@@ -101,13 +117,17 @@ class GapEstimator:
             self.counts[f"leg body refused: {refusal.value}"] += 1
 
     def add_calibration(self, told: ScopeCalibration) -> None:
-        """Take what a node says of its calibration; where nodes contradict each other nothing is valid."""
+        """Take what a node says of its calibration.
+
+        Where nodes contradict each other, or tell an error that is none, nothing is valid.
+        """
         known = self.calibrations.get(told.node)
         self.calibrations[told.node] = told
-        self.calibration_flaw = contradiction(self.calibrations)
-        errors = [one.error for one in self.calibrations.values()]
+        flaws = [contradiction(self.calibrations), *(one.flaw() for one in self.calibrations.values())]
+        self.calibration_flaw = next((flaw for flaw in flaws if flaw), "")
+        errors = [one.error for one in self.calibrations.values() if not one.flaw()]
         self._calibration_error = next((error for error in errors if error is not None), None)
-        if known is None or known.hash != told.hash:
+        if known is None or not told.says_the_same_as(known):
             # Views by another calibration are not comparable with those before.
             self._track = None
 
@@ -175,22 +195,33 @@ class GapEstimator:
         return estimates
 
     def _try(self, pending: Pending, now_ns: int) -> GapEstimate | None:
-        """Estimate of one image, or None while its lens pose may still come."""
+        """Estimate of one image, or None while its lens pose, or the turn at it, may still come."""
         edges = pending.edges
         if flaw := edges.flaw():
             return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, flaw)
+        may_wait = now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS
         pose = self._poses.at(edges.stamp_ns)
         if isinstance(pose, LensPose):
             if self._is_late(pending):
                 return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, LATE)
-            return self._measure(edges, pose)
+            turn = self._turns.at(edges.stamp_ns) if self._turn_is_followed() else 0.0
+            if not isinstance(turn, TurnRefusal):
+                return self._measure(edges, replace(pose, scope_turn=turn))
+            if turn is TurnRefusal.NOT_YET and may_wait:
+                return None
+            reason = TurnRefusal.NONE_NEAR.value
+            return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, reason)
         if pose is PoseRefusal.NOT_YET:
-            if now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS:
+            if may_wait:
                 return None
             return self._without(
                 edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, "no lens pose follows the image"
             )
         return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, pose.value)
+
+    def _turn_is_followed(self) -> bool:
+        """Whether somebody tells, or says that he will, how far the scope is turned in its camera head."""
+        return self._turn_told or any(one.turn_followed for one in self.calibrations.values())
 
     def _is_late(self, pending: Pending) -> bool:
         """Whether an image came so long after the poses of its time that its answer is of the past."""
@@ -206,6 +237,9 @@ class GapEstimator:
             return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, self.calibration_flaw)
         if self._leg is not None and (flaw := self._leg.flaw(edges.stamp_ns, pose.frame_id)):
             return self._without(edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, flaw)
+        error = self._calibration_error
+        if error is not None and error.clock > 0.0 and not np.isfinite(pose.motion).all():
+            return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, UNKNOWN_MOTION)
         begins = self._track is None or not self._track.continues_with(edges, pose)
         if self._leg is not None and not begins and self._leg_moved(self._leg, pose):
             self._track = None
@@ -213,8 +247,11 @@ class GapEstimator:
         if self._track is None or begins:
             self._leg_at_first = self._leg.pose if self._leg is not None else None
             self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
-        turned = replace(pose, scope_turn=self._turns.at(edges.stamp_ns))
-        estimate = self._track.add(edges, turned)
+        try:
+            estimate = self._track.add(edges, pose)
+        except (MeasurementError, ArithmeticError, ValueError):
+            self._track = None
+            return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, NO_NUMBERS)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))
 

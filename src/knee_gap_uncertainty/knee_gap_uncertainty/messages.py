@@ -76,6 +76,7 @@ def calibration_from_message(message: Any) -> ScopeCalibration:
         hash=str(message.hash),
         lens_covariance=np.array(message.lens_covariance, dtype=float).reshape(6, 6),
         time_offset_error=float(message.time_offset_error),
+        turn_followed=bool(message.turn_followed),
     )
 
 

@@ -135,7 +135,7 @@ class PoseBuffer:
         index = bisect_left(self._poses, stamp_ns, key=lambda pose: pose.stamp_ns)
         after = self._poses[index]
         if after.stamp_ns == stamp_ns:
-            around = self._before(index) if index else self._poses[min(1, len(self._poses) - 1)]
+            around = self._near(index)
             return replace(after, motion=_motion(around, after), motion_time=_seconds(around, after))
         before = self._poses[index - 1]
         age = round(self.max_pose_age * 1e9)
@@ -149,6 +149,18 @@ class PoseBuffer:
         """The earliest pose within MOTION_TIME before that of an index, at least the one before it."""
         start = self._poses[index].stamp_ns - MOTION_TIME_NS
         return self._poses[min(bisect_left(self._poses, start, key=lambda pose: pose.stamp_ns), index - 1)]
+
+    def _near(self, index: int) -> LensPose:
+        """The pose that tells the velocity at that of an index, before or after it; itself if none is near.
+
+        They are at most as far apart as the two around a stamp may be.
+        """
+        pose, longest_ns = self._poses[index], 2 * round(self.max_pose_age * 1e9)
+        others = [self._before(index)] if index else []
+        if index + 1 < len(self._poses):
+            others.append(self._poses[index + 1])
+        near = (other for other in others if abs(other.stamp_ns - pose.stamp_ns) <= longest_ns)
+        return next(near, pose)
 
     def _between(self, before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
         since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9

@@ -23,6 +23,13 @@ Array = npt.NDArray[np.float64]
 
 HASH_DIGITS = 12  # of a hash, in words
 
+# Standard deviations of shift [m] and rotation [rad] of the lens and of the clock [s] above which what is
+# told is a mistake.
+LARGEST_LENS_ERRORS = np.repeat([0.1, 1.0], 3)
+LARGEST_CLOCK_ERROR = 1.0
+# Of a covariance that was written and read, relative to its standard deviations.
+ROUNDING = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class ScopeCalibration:
@@ -30,21 +37,52 @@ class ScopeCalibration:
 
     `hash` is empty where it uses none. `lens_covariance` (6, 6) is that of a small shift [m^2] and a small
     rotation [rad^2] of the lens on its body, in the frame of the lens, `time_offset_error` [s] that of the
-    clock; both NaN where the node does not use them.
+    clock; all NaN where the node does not use them. `turn_followed` says that it tells the turn of the scope
+    in its camera head with each pose.
     """
 
     node: str
     hash: str
     lens_covariance: Array
     time_offset_error: float
+    turn_followed: bool = False
 
     @property
     def error(self) -> "CalibrationError | None":
-        """The error that views share; None where this node has nothing to say of it."""
-        if not np.isfinite(self.lens_covariance).all():
-            return None
-        seconds = self.time_offset_error
-        return CalibrationError(self.lens_covariance, seconds if np.isfinite(seconds) else 0.0)
+        """The error that views share, where `flaw` finds none in it; None where the node tells of none."""
+        seconds = 0.0 if np.isnan(self.time_offset_error) else self.time_offset_error
+        if not np.isnan(self.lens_covariance).all():
+            return CalibrationError(self.lens_covariance, seconds)
+        return CalibrationError(np.zeros((6, 6)), seconds) if seconds else None
+
+    def flaw(self) -> str:
+        """Why the error that is told cannot be one, in words; empty if it can."""
+        whose = f"the calibration's error that {self.node} tells"
+        seconds, covariance = self.time_offset_error, self.lens_covariance
+        if not (np.isnan(seconds) or 0.0 <= seconds <= LARGEST_CLOCK_ERROR):
+            return f"{whose} has a clock's error outside [0, {LARGEST_CLOCK_ERROR:g}] s"
+        if np.isnan(covariance).all():
+            return ""
+        if not np.isfinite(covariance).all():
+            return f"{whose} has numbers that are NaN or infinite"
+        variances = np.diag(covariance)
+        if (variances < 0.0).any() or (variances > LARGEST_LENS_ERRORS**2).any():
+            return f"{whose} has variances below 0 or larger than any lens's"
+        deviations = np.sqrt(variances)
+        scale = np.outer(deviations, deviations)
+        if (np.abs(covariance - covariance.T) > ROUNDING * scale).any():
+            return f"{whose} has a covariance that is not symmetric"
+        correlation = covariance / np.where(scale > 0.0, scale, 1.0)
+        beyond = (np.abs(covariance) > (1.0 + ROUNDING) * scale).any()
+        if beyond or np.linalg.eigvalsh(correlation).min() < -ROUNDING:
+            return f"{whose} has a covariance that is not positive semi-definite"
+        return ""
+
+    def says_the_same_as(self, other: "ScopeCalibration") -> bool:
+        """Whether views by either are comparable: the same calibration, error and turns."""
+        told, before = (np.append(one.lens_covariance, one.time_offset_error) for one in (self, other))
+        same = self.hash == other.hash and self.turn_followed == other.turn_followed
+        return same and bool(np.array_equal(told, before, equal_nan=True))
 
 
 def contradiction(told: dict[str, ScopeCalibration]) -> str:

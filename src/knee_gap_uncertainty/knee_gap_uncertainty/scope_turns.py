@@ -1,7 +1,9 @@
 """How far an oblique scope was turned in its camera head at an image, from what was told beside its poses."""
 
+from bisect import bisect_left
 from collections import deque
-from math import isfinite
+from enum import StrEnum
+from math import isfinite, pi, remainder
 from typing import NamedTuple
 
 KEPT = 512  # as long as poses of the lens may come late
@@ -14,22 +16,55 @@ class ScopeTurn(NamedTuple):
     turn: float
 
 
+class TurnRefusal(StrEnum):
+    """Why a turn is not kept, or why there is none at a stamp."""
+
+    NOT_FINITE = "the turn is NaN or infinite"
+    TOO_LARGE = "the turn is more than a whole one: is it in radians?"
+    NOT_YET = "no scope_turn follows the stamp yet"
+    NONE_NEAR = "no scope_turn lies near the image, and the scope's turn is followed"
+
+
 class ScopeTurns:
-    """The latest turns, in the order of their stamps."""
+    """The latest turns, in the order of their stamps; between two they are interpolated, never beyond one.
 
-    def __init__(self) -> None:
+    `max_age` [s] is the longest time between the stamp asked for and either of its two turns.
+    """
+
+    def __init__(self, max_age: float) -> None:
         self._turns: deque[ScopeTurn] = deque(maxlen=KEPT)
+        self._age_ns = round(max_age * 1e9)
 
-    def add(self, told: ScopeTurn) -> None:
-        """Take a turn; one before the last (a bag that starts again) begins anew, one not finite is left."""
+    def add(self, told: ScopeTurn) -> TurnRefusal | None:
+        """Take a turn, or return why not; one before the last (a bag that starts again) begins anew."""
         if not isfinite(told.turn):
-            return
+            return TurnRefusal.NOT_FINITE
+        if abs(told.turn) > 2.0 * pi:
+            return TurnRefusal.TOO_LARGE
         if self._turns and told.stamp_ns < self._turns[-1].stamp_ns:
             self._turns.clear()
+        if self._turns and told.stamp_ns == self._turns[-1].stamp_ns:
+            self._turns.pop()
         self._turns.append(told)
+        return None
 
-    def at(self, stamp_ns: int) -> float:
-        """The turn [rad] told nearest to a stamp: 0 where none ever was, as nobody follows it then."""
-        if not self._turns:
-            return 0.0
-        return min(reversed(self._turns), key=lambda told: abs(told.stamp_ns - stamp_ns)).turn
+    def forget_before(self, stamp_ns: int) -> None:
+        """Forget the turns before a stamp."""
+        while self._turns and self._turns[0].stamp_ns < stamp_ns:
+            self._turns.popleft()
+
+    def at(self, stamp_ns: int) -> float | TurnRefusal:
+        """Return the turn [rad] at a stamp, the shorter way round between two, or why there is none."""
+        if not self._turns or stamp_ns > self._turns[-1].stamp_ns:
+            return TurnRefusal.NOT_YET
+        index = bisect_left(self._turns, stamp_ns, key=lambda told: told.stamp_ns)
+        after = self._turns[index]
+        if after.stamp_ns == stamp_ns:
+            return after.turn
+        if index == 0:
+            return TurnRefusal.NONE_NEAR
+        before = self._turns[index - 1]
+        since, until = stamp_ns - before.stamp_ns, after.stamp_ns - stamp_ns
+        if max(since, until) > self._age_ns:
+            return TurnRefusal.NONE_NEAR
+        return before.turn + since / (since + until) * remainder(after.turn - before.turn, 2.0 * pi)

@@ -43,8 +43,9 @@ class UncertaintyNode(BaseNode):
         }
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
-        self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
+        # What waits is taken in this order: the turn that is told with a pose before the pose.
         self.create_subscription(ScopeTurn, "scope_turn", self.on_turn, RESULT_QOS)
+        self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
         if self._estimator.parameters.leg_motion > 0.0:
             self.create_subscription(PoseStamped, "leg_body/pose", self.on_leg_pose, TRACKER_QOS)
         # Latched by two nodes: of each the last word is wanted.
@@ -89,8 +90,8 @@ class UncertaintyNode(BaseNode):
         self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
 
     def on_turn(self, message: ScopeTurn) -> None:
-        """Take how far the scope is turned in its camera head."""
-        self._estimator.add_turn(messages.turn_from_message(message))
+        """Take how far the scope is turned, which may complete images that waited for it."""
+        self.publish(self._estimator.add_turn(messages.turn_from_message(message), self.now_ns()))
 
     def on_calibration(self, message: ScopeCalibration) -> None:
         """Take what a node says of its calibration of the scope."""

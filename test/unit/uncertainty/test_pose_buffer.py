@@ -85,6 +85,22 @@ def test_a_velocity_over_a_longer_time_is_taken_where_poses_are_rare():
     np.testing.assert_allclose(first.motion[:3], [0.01, -0.02, 0.05], rtol=1e-5)
 
 
+def test_no_velocity_is_taken_across_a_gap_in_the_poses():
+    buffer = PoseBuffer(max_pose_age=0.02)
+    stamps = [START_NS + ms * 1_000_000 for ms in (0, 30, 1000)]
+    for stamp_ns in stamps:
+        buffer.add(even_motion(stamp_ns))
+    alone = buffer.at(stamps[2])
+    assert isinstance(alone, LensPose)
+    assert np.isnan(alone.motion).all()
+    assert alone.motion_time == np.inf
+    buffer.add(even_motion(stamps[2] + 30_000_000))
+    followed = buffer.at(stamps[2])
+    assert isinstance(followed, LensPose)
+    assert followed.motion_time == pytest.approx(0.03)
+    np.testing.assert_allclose(followed.motion[:3], [0.01, -0.02, 0.05], rtol=1e-4)
+
+
 def test_interpolation_does_not_depend_on_the_frame():
     turn, shift = Rotation.from_euler("xyz", [20, 130, -70], degrees=True), np.array([3.0, -1.0, 2.0])
     here, there = PoseBuffer(), PoseBuffer()

@@ -1,5 +1,6 @@
 """The shared error of a calibration: what a refit with a wrong scope shows, whatever the views."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
-from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns
+from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns, TurnRefusal
 from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
 
 Array = npt.NDArray[np.float64]
@@ -158,17 +159,201 @@ def test_the_estimator_is_told_how_far_the_scope_is_turned() -> None:
         assert getattr(turned, high) > getattr(steady, high)
 
 
-def test_turns_are_kept_by_their_stamps() -> None:
-    turns = ScopeTurns()
-    assert turns.at(5) == 0.0
+def test_turns_are_kept_by_their_stamps_and_never_taken_from_afar() -> None:
+    turns = ScopeTurns(max_age=2e-8)
+    assert turns.at(5) is TurnRefusal.NOT_YET
     for stamp in range(1000):
         turns.add(ScopeTurn(10 * stamp, 1e-3 * stamp))
-    assert turns.at(9_004) == pytest.approx(0.9)
-    assert turns.at(9_006) == pytest.approx(0.901)
-    turns.add(ScopeTurn(10_000, float("nan")))
-    assert turns.at(20_000) == pytest.approx(0.999)
-    turns.add(ScopeTurn(20, 0.5))  # a bag that starts again
-    assert turns.at(9_000) == 0.5
+    assert turns.at(9_000) == pytest.approx(0.9)
+    assert turns.at(9_004) == pytest.approx(0.9004)
+    assert turns.at(0) is TurnRefusal.NONE_NEAR  # forgotten meanwhile
+    assert turns.add(ScopeTurn(10_000, float("nan"))) is TurnRefusal.NOT_FINITE
+    assert turns.add(ScopeTurn(10_000, 25.0)) is TurnRefusal.TOO_LARGE
+    assert turns.at(10_000) is TurnRefusal.NOT_YET
+    turns.add(ScopeTurn(10_050, 1.0))
+    assert turns.at(10_000) is TurnRefusal.NONE_NEAR
+    turns.add(ScopeTurn(20, 3.1))  # a bag that starts again
+    assert turns.at(9_000) is TurnRefusal.NOT_YET
+    turns.add(ScopeTurn(30, -3.1))  # the shorter way round
+    assert turns.at(25) == pytest.approx(np.pi)
+
+
+SHIFT = np.diag([1e-6, 1e-6, 0, 0, 0, 0])
+
+
+def turned_estimates(
+    turn_at: Callable[[int], float | None], *, followed: bool = False, late: bool = False, shift: int = 0
+) -> tuple[list[GapEstimate], GapEstimator]:
+    """What the estimator says of 40 views, a turn told with each where `turn_at` has one; `late`: last."""
+    estimator, views, found = GapEstimator(), scope(40, 0.0), []
+    estimator.add_calibration(replace(told("tracking_node", "a" * 64, error=SHIFT), turn_followed=followed))
+    assert views.lens_rotations is not None
+    for k in range(40):
+        stamp_ns = 10**18 + k * 10_000_000
+        rotation = views.lens_rotations[k]
+        bearings = views.bearings[k] @ rotation
+        edges = EdgeObservation(stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), 6e-3)
+        quaternion, covariance = Rotation.from_matrix(rotation).as_quat(), np.diag([1e-10] * 3 + [1e-9] * 3)
+        pose = LensPose(stamp_ns, "world", views.lens_positions[k], quaternion, covariance)
+        turn = turn_at(k)
+        if turn is not None and not late:
+            found += estimator.add_turn(ScopeTurn(stamp_ns + shift, turn), stamp_ns)
+        found += estimator.add_pose(pose, stamp_ns)
+        found += estimator.add_edges(edges, stamp_ns)
+        if turn is not None and late:
+            found += estimator.add_turn(ScopeTurn(stamp_ns + shift, turn), stamp_ns)
+    found += estimator.advance(stamp_ns + 10**8)
+    return [one for one in found if one.status is not GapStatus.NO_EDGES], estimator
+
+
+def test_an_image_without_a_turn_is_not_valid_where_turns_are_told() -> None:
+    for followed in (False, True):
+        found, estimator = turned_estimates(lambda k: 0.005 * k if k < 20 else None, followed=followed)
+        assert len(found) == 40
+        assert {one.status for one in found[20:]} == {GapStatus.OUT_OF_SYNC}
+        assert "scope_turn" in found[-1].reason
+        assert estimator.counts[f"OUT_OF_SYNC: {found[-1].reason}"] == 20
+        assert found[19].status is GapStatus.VALID
+
+
+def test_an_image_without_a_turn_is_not_valid_where_the_node_says_that_it_follows_it() -> None:
+    found, _ = turned_estimates(lambda _: None, followed=True)
+    assert {one.status for one in found} == {GapStatus.OUT_OF_SYNC}
+    assert turned_estimates(lambda _: None)[0][-1].status is GapStatus.VALID
+
+
+def test_views_from_before_the_first_turn_are_not_compared_with_those_after_it() -> None:
+    late, _ = turned_estimates(lambda k: 0.3 if k >= 30 else None)
+    assert late[29].status is GapStatus.VALID
+    assert late[30].status is not GapStatus.VALID
+    assert late[30].baseline == 0.0
+
+
+def test_a_turn_that_is_not_finite_is_counted_and_leaves_its_image_without() -> None:
+    found, estimator = turned_estimates(lambda _: float("nan"))
+    assert {one.status for one in found} == {GapStatus.OUT_OF_SYNC}
+    assert estimator.counts[f"scope_turn refused: {TurnRefusal.NOT_FINITE.value}"] == 40
+
+
+def test_an_image_waits_for_the_turn_that_comes_after_its_pose() -> None:
+    soon, _ = turned_estimates(lambda k: 0.005 * k, followed=True)
+    late, _ = turned_estimates(lambda k: 0.005 * k, followed=True, late=True)
+    assert [one.stamp_ns for one in late] == [one.stamp_ns for one in soon]
+    assert [one.gap_max for one in late[5:]] == [one.gap_max for one in soon[5:]]
+    assert late[-1].status is GapStatus.VALID
+
+
+def test_a_turn_between_two_that_are_told_is_as_good_as_one_told() -> None:
+    exact, _ = turned_estimates(lambda k: 0.005 * k)
+    between, _ = turned_estimates(lambda k: 0.005 * (k + 0.4), shift=4_000_000)
+    assert between[-2].status is GapStatus.VALID
+    # The first image, before the first turn, has none: the views begin a little later.
+    assert between[-2].gap_max == pytest.approx(exact[-2].gap_max, rel=0.1)
+
+
+GOOD = np.diag([1e-8] * 3 + [1e-5] * 3)
+ONE_NAN = GOOD.copy()
+ONE_NAN[0, 1] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("covariance", "clock"),
+    [
+        (ONE_NAN, 0.0),
+        (np.full((6, 6), np.inf), 0.0),
+        (-GOOD, 1e-3),
+        (np.diag([1e-8] * 3 + [3e-5, -1e-5, -1e-5]), 1e-3),
+        (GOOD + np.triu(np.full((6, 6), 1e-9), 1), 1e-3),
+        (GOOD + 2e-8 * (np.eye(6, k=1) + np.eye(6, k=-1)), 1e-3),
+        (
+            GOOD - 9e-9 * (np.ones((6, 6)) - np.eye(6)) * np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]),
+            1e-3,
+        ),
+        (np.full((6, 6), 1e300), 0.0),
+        (np.diag([1e8] * 3 + [1e-6] * 3), 0.0),
+        (GOOD, -1.0),
+        (GOOD, np.inf),
+        (GOOD, 1e300),
+        (np.full((6, 6), np.nan), np.inf),
+    ],
+)
+def test_a_calibrations_error_that_is_none_leaves_nothing_valid(covariance: Array, clock: float) -> None:
+    wrong = ScopeCalibration("tracking_node", "a" * 64, covariance, clock)
+    assert "tracking_node" in wrong.flaw()
+    found = estimates(wrong)
+    assert {one.status for one in found} == {GapStatus.UNKNOWN}
+    assert found[-1].reason == wrong.flaw()
+
+
+@pytest.mark.parametrize("clock", [np.nan, 0.0])
+def test_not_used_is_no_flaw(clock: float) -> None:
+    nothing = ScopeCalibration("tracking_node", "a" * 64, np.full((6, 6), np.nan), clock)
+    assert not nothing.flaw()
+    assert nothing.error is None
+    lens = replace(nothing, lens_covariance=GOOD)
+    assert not lens.flaw()
+    assert lens.error is not None
+    assert lens.error.clock == 0.0
+    clock_only = replace(nothing, time_offset_error=1e-3)
+    assert clock_only.error is not None
+    assert clock_only.error.clock == 1e-3
+
+
+def test_a_covariance_that_was_rounded_in_a_file_is_one() -> None:
+    column = np.array([1e-4, -2e-4, 1.5e-4, 1e-3, 2e-3, -1e-3])
+    rounded = np.array([[float(f"{number:.7g}") for number in row] for row in np.outer(column, column)])
+    assert not told("tracking_node", "a" * 64, error=rounded).flaw()
+
+
+def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
+    estimator, views = GapEstimator(), scope(2, 0.0)
+    assert views.lens_rotations is not None
+    rotation = views.lens_rotations[0]
+    bearings = views.bearings[0] @ rotation
+    same = told("tracking_node", "a" * 64, error=GOOD)
+    estimator.add_calibration(same)
+    counts = []
+    for k, calibration in enumerate((same, replace(same), replace(same, lens_covariance=2.0 * GOOD))):
+        estimator.add_calibration(calibration)
+        stamp_ns = 10**18 + k * 10_000_000
+        place = views.lens_positions[0] + [1e-3 * k, 0.0, 0.0]
+        quaternion, covariance = Rotation.from_matrix(rotation).as_quat(), np.diag([1e-10] * 3 + [1e-9] * 3)
+        estimator.add_pose(LensPose(stamp_ns, "world", place, quaternion, covariance), stamp_ns)
+        edges = EdgeObservation(stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), 6e-3)
+        counts += [one.baseline for one in estimator.add_edges(edges, stamp_ns)]
+    assert counts == pytest.approx([0.0, 1e-3, 0.0])
+
+
+@pytest.mark.parametrize("error", [np.diag([1e-2] * 3 + [1.0] * 3), np.zeros((6, 6))])
+@pytest.mark.parametrize("clock", [0.0, 1.0])
+@pytest.mark.parametrize("turning", [0.0, 0.3])
+def test_the_largest_error_that_is_taken_gives_statuses(error: Array, clock: float, turning: float) -> None:
+    found = estimates(
+        replace(told("tracking_node", "a" * 64, error=error), time_offset_error=clock), turning=turning
+    )
+    assert len(found) == 40
+    if clock or error.any():
+        assert GapStatus.VALID not in {one.status for one in found}
+
+
+def test_what_cannot_be_calculated_with_is_a_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr("knee_gap_uncertainty.track.explained_by", singular)
+    found = estimates(told("tracking_node", "a" * 64, error=GOOD))
+    assert {one.status for one in found} == {GapStatus.UNKNOWN}
+    assert "calculated" in found[-1].reason
+
+
+def test_an_image_whose_velocity_is_unknown_is_not_taken_where_the_clock_is_uncertain() -> None:
+    """The first image lies at the only pose there is then."""
+    uncertain = replace(told("tracking_node", "a" * 64, error=GOOD), time_offset_error=1e-3)
+    found = estimates(uncertain)
+    assert found[0].status is GapStatus.OUT_OF_SYNC
+    assert "how fast the lens moved" in found[0].reason
+    assert found[1].status is not GapStatus.OUT_OF_SYNC
+    assert estimates(told("tracking_node", "a" * 64, error=GOOD))[0].status is not GapStatus.OUT_OF_SYNC
 
 
 def test_it_does_not_average_out() -> None:
@@ -269,7 +454,7 @@ def estimates(
             np.diag([1e-10] * 3 + [1e-9] * 3),
         )
         if scope_turn:
-            estimator.add_turn(ScopeTurn(stamp_ns, scope_turn * k / 39))
+            found += estimator.add_turn(ScopeTurn(stamp_ns, scope_turn * k / 39), stamp_ns)
         estimator.add_pose(pose, stamp_ns)
         found += estimator.add_edges(edges, stamp_ns)
     return found
