@@ -214,6 +214,8 @@ class PoseValidity:
         if last is not None and _identical(last, body):
             return RefusalReason.FROZEN, "the pose repeats the one before it bit by bit: the driver is frozen"
         if swapped_with is not None:
+            # While the labels are in doubt, no time that passes confirms a jump.
+            self._jump_stamp_ns = body.stamp_ns
             return RefusalReason.SWAPPED, f"the tracker calls '{swapped_with}' by the name of the body"
         self._last = body
         if last is None:

@@ -281,6 +281,20 @@ class TestSwappedBodies:
         assert wrong == 0
         assert set(range(240, 400)) <= accepted
 
+    def test_a_jump_is_not_confirmed_by_the_time_in_which_labels_are_in_doubt(self):
+        """Jump and swap at once turn the names round; then the labels swap again where nothing is seen."""
+        tracker, wrong = ScopeTracker(AT_BODY, validity=ValidityParameters(jump_hold=1.0)), 0
+        for i in [*range(260), *range(300, 340)]:
+            scope, leg = hand_motion(i), hand_motion(i, name="leg", centre=(0.25, 0.1, 0.0))
+            true = scope.position
+            if 100 <= i < 160:
+                scope = moved(scope, [0.06, 0.0, 0.02])
+            if 100 <= i < 160 or i >= 300:
+                scope, leg = replace(leg, name="scope"), replace(scope, name="leg")
+            if isinstance(tracker.update(scope, [leg]), LensPose):
+                wrong += bool(np.linalg.norm(scope.position - true) > 1e-3)
+        assert wrong == 0
+
     def test_labels_that_stay_are_believed_when_the_hold_is_over(self):
         """As after a start with swapped labels, which nothing can tell."""
         tracker, found = ScopeTracker(AT_BODY, validity=ValidityParameters(jump_hold=1.0)), []
