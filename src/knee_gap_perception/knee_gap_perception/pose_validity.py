@@ -205,18 +205,19 @@ class PoseValidity:
         self._swapped = SwappedBodies()
         self._swapped.update((body, *others))
         self._swap_stamp_ns = None
-        # The labels are believed from here on: the body begins where its label is.
-        self._last = self._before_jump = None
-        return None
+        # The labels are believed from here on: the body begins where its label is, and its next pose is
+        # judged by that. This one has nothing to be judged by: it may be a frozen one.
+        self._last, self._before_jump = body, None
+        return other
 
     def _motion_fault(self, body: BodyPose, swapped_with: str | None) -> tuple[RefusalReason, str] | None:
         last = self._last
-        if last is not None and _identical(last, body):
-            return RefusalReason.FROZEN, "the pose repeats the one before it bit by bit: the driver is frozen"
         if swapped_with is not None:
             # While the labels are in doubt, no time that passes confirms a jump.
             self._jump_stamp_ns = body.stamp_ns
             return RefusalReason.SWAPPED, f"the tracker calls '{swapped_with}' by the name of the body"
+        if last is not None and _identical(last, body):
+            return RefusalReason.FROZEN, "the pose repeats the one before it bit by bit: the driver is frozen"
         self._last = body
         if last is None:
             return None
