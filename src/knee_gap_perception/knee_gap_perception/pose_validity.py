@@ -168,6 +168,11 @@ class PoseValidity:
             return RefusalReason.DUPLICATE, "the pose has the stamp of the one before it"
         if previous is not None:
             self._intervals.append((body.stamp_ns - previous) / 1e9)
+            if body.stamp_ns - previous > RETURN_TIME * 1e9:
+                # Time in which nothing came confirms neither a jump nor where the labels are.
+                self._jump_stamp_ns += body.stamp_ns - previous
+                if self._swap_stamp_ns is not None:
+                    self._swap_stamp_ns += body.stamp_ns - previous
         self._stamp_ns = body.stamp_ns
         return None
 
