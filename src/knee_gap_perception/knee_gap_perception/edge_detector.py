@@ -11,7 +11,6 @@ from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder
-from knee_gap_perception.foreign_bodies import foreign_bodies
 from knee_gap_perception.gap_search import GapSearch, NoPointsError, check_light
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
@@ -227,10 +226,9 @@ class GapEdgeDetector:
         field: FieldOfView,
     ) -> list[Sighting]:
         """Find the gap, choose the points and begin a track."""
-        section = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
+        section, foreign, scale = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
         inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
-        small, scale = self._search.smaller(picture)
-        points = choose_points(grey, section, field, inset_px, foreign_bodies(small), scale)
+        points = choose_points(grey, section, field, inset_px, foreign, scale)
         if points is None:
             raise NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"

@@ -1,5 +1,7 @@
 """The search for the gap in one picture: segmentation, section, and the decision whether it is a gap."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,7 @@ from knee_gap_perception.segmentation.choice import segmentation_named
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
@@ -28,6 +31,14 @@ class NoPointsError(Exception):
     def __init__(self, status: EdgeStatus, reason: str) -> None:
         super().__init__(reason)
         self.status = status
+
+
+class Found(NamedTuple):
+    """A section; where the picture, made smaller by `scale`, shows what is no tissue: `foreign` (h, w)."""
+
+    section: Section
+    foreign: Mask
+    scale: float
 
 
 class GapSearch:
@@ -49,7 +60,7 @@ class GapSearch:
 
     def mask(self, picture: Image, field: FieldOfView) -> Image:
         """Gap of a picture (h, w, 3): 255 where it is (h, w)."""
-        small, scale = self.smaller(picture)
+        small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
         dark = self._segmentation(small, inside & ~foreign_bodies(small))
         size = (picture.shape[1], picture.shape[0])
@@ -58,10 +69,10 @@ class GapSearch:
 
     def agreed_section(
         self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None
-    ) -> Section:
+    ) -> Found:
         """As `section`, if the images just before that of a stamp [ns] do not speak against it."""
         try:
-            section = self.section(picture, camera, field, clicked)
+            found = self.section(picture, camera, field, clicked)
         except NoPointsError as refusal:
             if refusal.status is EdgeStatus.NO_GAP:
                 self._evidence.add(stamp_ns, np.nan_to_num(self.confidence))
@@ -73,15 +84,15 @@ class GapSearch:
                 f"the images just before showed no gap: the confidence of all is {confidence:.2f}, needed is "
                 f"{self.parameters.minimum_confidence:.2f}",
             )
-        return section
+        return found
 
-    def section(self, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None) -> Section:
+    def section(self, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None) -> Found:
         """The section of the gap in a picture (h, w, 3), or of the one at a clicked pixel (2,).
 
         Raises NoPointsError where the picture shows none.
         """
         self.confidence = float("nan")
-        small, scale = self.smaller(picture)
+        small, scale = self._smaller(picture)
         inside = field.mask(
             (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
         )
@@ -108,9 +119,9 @@ class GapSearch:
                 f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
                 f"{self.parameters.minimum_confidence:.2f}",
             )
-        return section
+        return Found(section, foreign, scale)
 
-    def smaller(self, picture: Image) -> tuple[Image, float]:
+    def _smaller(self, picture: Image) -> tuple[Image, float]:
         """A picture (h, w, 3) at working size, and its scale against the full one."""
         scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
         size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
