@@ -190,6 +190,45 @@ def _structures(
     return owns, crosses
 
 
+def _reweighted(patch: Float32, change: Array) -> Float32:
+    """The patch (n, n, 4), the gradients of each block multiplied by a matrix (blocks, blocks, 2, 2)."""
+    blocks = change.shape[0]
+    changed = patch.copy()
+    for i in range(patch.shape[0]):
+        for j in range(patch.shape[1]):
+            if patch[i, j, 3] <= 0.0:
+                continue
+            matrix = change[i * blocks // patch.shape[0], j * blocks // patch.shape[1]]
+            dx, dy = patch[i, j, 1], patch[i, j, 2]
+            changed[i, j, 1] = matrix[0, 0] * dx + matrix[0, 1] * dy
+            changed[i, j, 2] = matrix[1, 0] * dx + matrix[1, 1] * dy
+    return changed
+
+
+def _block_tensors(
+    dx: Float32, dy: Float32, weight: Float32, window: Array, corner: tuple[int, int], step: int, blocks: int
+) -> tuple[Array, float]:
+    """Structure tensors (blocks^2, 3) as xx, xy, yy of a square of gradients (h, w), and its weight.
+
+    `corner` is its first row and column; every `step`-th pixel is looked at, each with its share of the
+    `window` (n, n).
+    """
+    tensors, total = np.zeros((blocks * blocks, 3)), 0.0
+    n = window.shape[0]
+    for i in range(n):
+        row = corner[0] + step * i
+        for j in range(n):
+            column = corner[1] + step * j
+            share = window[i, j] * weight[row, column]
+            total += share
+            gx, gy = dx[row, column], dy[row, column]
+            block = tensors[(i * blocks // n) * blocks + j * blocks // n]
+            block[0] += share * gx * gx
+            block[1] += share * gx * gy
+            block[2] += share * gy * gy
+    return tensors, total
+
+
 # No fast arithmetic: the same pixels must give the same bits.
 sample = numba.njit(cache=True)(_sample)
 spread = numba.njit(cache=True)(_spread)
@@ -200,3 +239,7 @@ bilinear = numba.njit(cache=True)(_bilinear)
 structures: Callable[[Float32, Float32, Float32, Array, int], tuple[Array, Array]] = numba.njit(cache=True)(
     _structures
 )
+reweighted: Callable[[Float32, Array], Float32] = numba.njit(cache=True)(_reweighted)
+block_tensors: Callable[
+    [Float32, Float32, Float32, Array, tuple[int, int], int, int], tuple[Array, float]
+] = numba.njit(cache=True)(_block_tensors)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.patch_kernel import normal_equations, structures
+from knee_gap_perception.patch_kernel import normal_equations, reweighted, structures
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -33,15 +33,14 @@ SPECK = 6.0  # times the usual detail of a surface, from which something bright 
 SPECK_RIM = 7  # [px] side of what is left out around each of its pixels
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
-CERTAIN = 0.95  # correlation of textures up to which the noise alone tells the error of a registration
-DOUBT = 3.0  # growth of the error's logarithm as the correlation falls below that
 GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
-NOISE_CORRELATION = 1.6  # factor on the variance: the residuals of neighbouring pixels are not independent
+NOISE_CORRELATION = 2.7  # factor on the variance: the residuals of neighbouring pixels are not independent
 MAXIMUM_ITERATIONS = 12
 CONVERGED = 0.02  # [px]
 FINISHING = 2  # iterations in which only gradients count that both textures have
 BLOCKS = 3  # a side, in which that is told apart
-CHANCE = 0.1  # [-] share of them that two textures of mere noise have in common
+CHANCE = 0.1  # [-] share of them, and correlation, that two textures of mere noise have in common
+LEAST_LIKENESS = 0.02  # [-] of textures that have nothing in common
 
 
 @dataclass(frozen=True)
@@ -173,20 +172,6 @@ class Patch:
         sparse = (np.indices((side, side)) % 2 == 0).all(axis=0)
         self._pixels = np.stack([self.texture, dx, dy, self.weight * sparse], axis=-1).astype(np.float32)
 
-    def information(self, limit: float = float("inf")) -> Array:
-        """Structure tensor (2, 2) of the texture under the patch's weight: what it can say about a shift.
-
-        Of a block it takes no more than `limit` times what the median block says.
-        """
-        outer = self._pixels[..., 1:3, None].astype(np.float64) * self._pixels[..., None, 1:3]
-        outer *= self.weight[..., None, None]
-        starts = np.arange(BLOCKS) * outer.shape[0] // BLOCKS
-        blocks = np.add.reduceat(np.add.reduceat(outer, starts, axis=0), starts, axis=1).reshape(-1, 2, 2)
-        amounts = np.trace(blocks, axis1=1, axis2=2)
-        if np.isfinite(limit):
-            blocks *= np.minimum(1.0, limit * np.median(amounts) / np.maximum(amounts, 1e-9))[:, None, None]
-        return np.asarray(blocks.sum(axis=0))
-
     def find(self, surface: Surface, start: Warp, prior: Array) -> Registration:
         """The patch in another image, from a predicted warp with the covariance (6, 6) of its parameters.
 
@@ -205,7 +190,7 @@ class Patch:
         pixels, finishing = self._pixels, 0
         for turn in range(MAXIMUM_ITERATIONS):
             hessian, slope, told = self._look(pixels, surface, warp, gain)
-            precision = 1.0 / (NOISE_CORRELATION * told[0] ** 2 * _doubt(told[2]))
+            precision = _likeness(told[2]) / (NOISE_CORRELATION * told[0] ** 2)
             posterior = hessian * precision + prior_information
             step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
             deviation += step
@@ -243,10 +228,7 @@ class Patch:
         shares, axes = np.linalg.eigh(inverse @ cross @ inverse)
         shares = np.clip((shares - CHANCE) / (1.0 - CHANCE), 0.0, 1.0)
         agreement = root @ ((axes * shares[..., None, :]) @ np.swapaxes(axes, -1, -2)) @ inverse
-        block = np.arange(self._pixels.shape[0]) * BLOCKS // self._pixels.shape[0]
-        pixels: Float32 = self._pixels.copy()
-        pixels[..., 1:3] = np.einsum("ijkl,ijl->ijk", agreement[np.ix_(block, block)], self._pixels[..., 1:3])
-        return pixels
+        return reweighted(self._pixels, agreement)
 
     def _look(self, pixels: Float32, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
         return normal_equations(pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain)
@@ -257,13 +239,14 @@ class Patch:
         return np.concatenate([warp.shape, corner[:, None]], axis=1)
 
 
-def _doubt(correlation: float) -> float:
-    """Factor on the variance of a registration whose textures correlate no better than this.
+def _likeness(correlation: float) -> float:
+    """Share of the information on a shift that counts, of textures that correlate so.
 
     The noise of both textures makes gradients that say nothing, and may lock onto each other. Found on the
-    simulated knee: the error of a registration grows exponentially as the correlation falls.
+    simulated knee, where what registrations add to the error was told apart from what grows with the
+    parallax: the variance goes as the inverse of the correlation beyond chance.
     """
-    return float(np.exp(2.0 * DOUBT * max(CERTAIN - max(correlation, 0.0), 0.0)))
+    return min(max((correlation - CHANCE) / (1.0 - CHANCE), LEAST_LIKENESS), 1.0)
 
 
 def _compose(warp: Warp, step: Array) -> Warp:

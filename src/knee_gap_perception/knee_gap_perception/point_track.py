@@ -38,16 +38,16 @@ WIDE = 6.0  # [px] standard deviation of the place that the pose tells, from whi
 FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
-HANDOVER_ERROR = 0.10  # [px] error that a patch adds when it is taken from a later image
-REGISTRATION_FLOOR = 0.10  # [px] below which no registration is believed
+HANDOVER_ERROR = 0.05  # [px] error that a patch adds when it is taken from a later image
+REGISTRATION_FLOOR = 0.06  # [px] below which no registration is believed
 # Errors that grow with the parallax since the first image: light that moves, relief that is no plane. They
 # stretch or shrink the parallax more than they turn it. Towards a contour the surface bends away; beside
 # mere shading the light carries what is seen.
 PARALLAX_ERROR = {  # [-] of the parallax, along it and across it
-    EdgeKind.RIM: (0.003, 0.0015),
-    EdgeKind.CONTOUR: (0.005, 0.003),
+    EdgeKind.RIM: (0.0025, 0.0005),
+    EdgeKind.CONTOUR: (0.0062, 0.001),
     EdgeKind.SHADING: (0.2, 0.02),
-    EdgeKind.UNKNOWN: (0.005, 0.003),
+    EdgeKind.UNKNOWN: (0.0062, 0.001),
 }
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose

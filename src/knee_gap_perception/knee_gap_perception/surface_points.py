@@ -1,6 +1,7 @@
 """Where on the tissue beside an edge a point is best followed."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,8 +10,8 @@ import numpy.typing as npt
 from knee_gap_perception.edge_kind import edge_kind
 from knee_gap_perception.edges import EdgeKind
 from knee_gap_perception.field_of_view import FieldOfView
-from knee_gap_perception.patch_registration import Patch, surface_around
 from knee_gap_perception.section import Section
+from knee_gap_perception.tissue_texture import TissueTexture
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -44,6 +45,14 @@ class SurfacePoint:
     outward: Array
 
 
+class _Place(NamedTuple):
+    """A pixel (2,) beside an edge of a kind, `shift` [px] along it from the section."""
+
+    pixel: Array
+    shift: int
+    kind: EdgeKind
+
+
 def choose_points(
     grey: Image, section: Section, field: FieldOfView, inset_px: float, foreign: Mask, scale: float
 ) -> list[SurfacePoint] | None:
@@ -65,20 +74,23 @@ def choose_points(
         if tissue <= gap:
             return None
         dark_below = gap + DARK_SHARE * (tissue - gap)
-        candidates = []
+        places = []
         for shift in ALONG:
             start = section.edges[index] + shift * along
             edge = _edge_on_line(grey, start, outward, reach, (gap + tissue) / 2)
             if edge is not None:
-                places = [edge + share * inset_px * outward for share in INSETS]
-                candidates += [_judge(grey, place, dark_below, shift, edge, outward) for place in places]
-        usable = [point for point in candidates if field.depth_inside(point.pixel) > 2 * PATCH_HALF]
-        usable = [point for point in usable if _is_clear(point.pixel, near, scale)]
+                insets = edge + np.outer(INSETS, inset_px * outward)
+                deep = field.depth_inside(insets) > 2 * PATCH_HALF
+                usable = [pixel for pixel in insets[deep] if _is_clear(pixel, near, scale)]
+                if usable:
+                    kind = edge_kind(grey, edge, outward)
+                    places += [_Place(pixel, shift, kind) for pixel in usable]
+        if not places:
+            return None
+        candidates = _judged(grey, places, dark_below, outward)
         # Where no surface ends, what looks like the texture of one may be that of another behind it.
-        best = max(
-            usable, key=lambda point: (point.kind is not EdgeKind.SHADING, point.texture), default=None
-        )
-        if best is None or best.texture <= 0:
+        best = max(candidates, key=lambda point: (point.kind is not EdgeKind.SHADING, point.texture))
+        if best.texture <= 0:
             return None
         chosen.append(best)
     return chosen
@@ -114,15 +126,18 @@ def _edge_on_line(grey: Image, start: Array, outward: Array, reach: float, thres
     return np.asarray(start + steps[dark[-1] + 1] * outward)
 
 
-def _judge(
-    grey: Image, pixel: Array, dark_below: float, shift: float, edge: Array, outward: Array
-) -> SurfacePoint:
-    surface = surface_around(grey, pixel, PATCH_HALF + 10, dark_below)
-    patch = Patch(surface, pixel, PATCH_HALF)
-    texture = 0.0
-    if patch.coverage >= MINIMUM_TISSUE:
-        # Away from the section the distance of the points is no longer that of the edges.
-        texture = float(np.linalg.eigvalsh(patch.information(MOST_OF_A_BLOCK))[0]) * (
-            1.0 - (shift / 120.0) ** 2
-        )
-    return SurfacePoint(pixel, dark_below, texture, edge_kind(grey, edge, outward), outward)
+def _judged(grey: Image, places: list[_Place], dark_below: float, outward: Array) -> list[SurfacePoint]:
+    """The places with the texture there."""
+    pixels = np.stack([place.pixel for place in places])
+    centre = (pixels.min(axis=0) + pixels.max(axis=0)) / 2
+    reach = float(np.abs(pixels - centre).max()) + 1.0
+    tissue = TissueTexture(grey, centre, reach, PATCH_HALF, dark_below)
+    points = []
+    for place in places:
+        information, share = tissue.information(place.pixel, MOST_OF_A_BLOCK)
+        texture = 0.0
+        if share >= MINIMUM_TISSUE:
+            # Away from the section the distance of the points is no longer that of the edges.
+            texture = float(np.linalg.eigvalsh(information)[0]) * (1.0 - (place.shift / 120.0) ** 2)
+        points.append(SurfacePoint(place.pixel, dark_below, texture, place.kind, outward))
+    return points

@@ -109,17 +109,6 @@ def test_shading_beside_an_edge_holds_a_patch_back_less_through_a_window_that_gr
     assert errors[:, 0].mean() < 0.5 * errors[:, 1].mean()
 
 
-def test_one_spot_of_dark_debris_is_not_taken_for_texture_to_follow():
-    rng = np.random.default_rng(1)
-    textured = _patch(_seen(_speckle(rng, 12.0), np.zeros(2), 1.0, rng))
-    spotted = _patch(_seen(_speckle(rng, 1.0) - _shred(np.array([118.0, 118.0])), np.zeros(2), 1.0, rng))
-    share = [
-        np.linalg.eigvalsh(patch.information(1.5))[0] / np.linalg.eigvalsh(patch.information())[0]
-        for patch in (textured, spotted)
-    ]
-    assert share[1] < 0.9 * share[0]
-
-
 def _shred(place: np.ndarray) -> np.ndarray:
     """Light (256, 256) that a small piece of something pale adds where it drifts by."""
     rows, columns = np.mgrid[:256, :256]
