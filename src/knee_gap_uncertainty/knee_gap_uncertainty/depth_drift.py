@@ -5,6 +5,11 @@ point lag behind its parallax, or run ahead of it, by a share that stays much th
 that are wrong by a share s of their parallax since the first view are without a contradiction the bearings of
 a point whose distance from the first lens is smaller by that share. No residual tells it, so it is
 considered: each point's covariance grows along the ray from the first lens.
+
+How large that share is, the bearings' own covariances tell best: they differ between a rim and a contour, and
+where little texture is shared it is the registrations themselves that are wrong in the same way. So of what
+the best single view leaves open of a point's depth a share of the variance lasts, however many views there
+are; what the covariances do not tell comes on top.
 """
 
 from dataclasses import replace
@@ -13,24 +18,53 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.multi_view import MultiViewFit, points_jacobian
+from knee_gap_uncertainty.views import Views
+
+Array = npt.NDArray[np.float64]
 
 
-def with_depth_drift(fit: MultiViewFit, first_lens: npt.NDArray[np.float64], drift: float) -> MultiViewFit:
+# [rad] by which a bearing would turn were its point at the first lens: below it a view tells no depth.
+LEAST_TURN = 1e-4
+
+
+def with_depth_drift(
+    fit: MultiViewFit, views: Views, first_lens: Array, drift: float, lasting_share: float
+) -> MultiViewFit:
     """The fit with a drift in its covariances and in the common part of its shares.
 
-    `first_lens` (3,) [m] is the lens of the track's first view, `drift` [-] the standard deviation of the
-    share, independent in both points. With none the fit is returned as it is.
+    `first_lens` (3,) [m] is the lens of the track's first view; `drift` [-] the standard deviation of the
+    share that no covariance tells, independent in both points; `lasting_share` [-] the share of the variance
+    of the best of the `views` that lasts over a track. With none of both the fit is returned as it is.
     """
-    if not (drift > 0.0 and np.isfinite(fit.points).all()):
+    if not ((drift > 0.0 or lasting_share > 0.0) and np.isfinite(fit.points).all()):
         return fit
+    variances = drift**2 + lasting_share * np.square(single_view_drift(fit, views, first_lens))
     added = np.zeros((6, 6))
     for n in range(2):
-        ray = drift * (fit.points[n] - first_lens)
-        added[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] = np.outer(ray, ray)
+        ray = fit.points[n] - first_lens
+        added[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] = variances[n] * np.outer(ray, ray)
     return widened(fit, added)
 
 
-def widened(fit: MultiViewFit, added: npt.NDArray[np.float64]) -> MultiViewFit:
+def single_view_drift(fit: MultiViewFit, views: Views, first_lens: Array) -> Array:
+    """Standard deviation (2,) [-] of the drift of each point that the best single view leaves open.
+
+    A drift by a share s turns the bearing of a view by s times the ray from the first lens, across the
+    bearing and against the distance. At most 1: with no parallax at all, nothing is known.
+    """
+    rays = fit.points - first_lens
+    sights = fit.points - views.lens_positions[:, None]
+    distances = np.linalg.norm(sights, axis=-1, keepdims=True)
+    bearings = sights / distances
+    turned = (rays - np.sum(rays * bearings, axis=-1, keepdims=True) * bearings) / distances
+    size = np.sum(turned * turned, axis=-1)
+    spread = np.einsum("vni,vnij,vnj->vn", turned, views.bearing_covariances, turned)
+    told = fit.used & (size > LEAST_TURN**2)
+    variances = np.divide(spread, size**2, out=np.ones_like(size), where=told)
+    return np.asarray(np.sqrt(np.minimum(variances.min(axis=0), 1.0)))
+
+
+def widened(fit: MultiViewFit, added: Array) -> MultiViewFit:
     """The fit with a covariance (6, 6) [m^2] of both points added, as common part of its shares."""
     inverse = np.linalg.inv(points_jacobian(fit.frames, fit.unknowns))
     wider = replace(

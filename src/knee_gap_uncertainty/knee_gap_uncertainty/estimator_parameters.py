@@ -48,11 +48,20 @@ class EstimatorParameters:
         },
     )
     depth_drift: float = field(
-        default=0.008,
+        default=0.002,
         metadata={
             "description": "standard deviation of the share of its parallax by which the image carries a "
-            "point too far or not far enough, the same over a track [-]",
+            "point too far or not far enough, the same over a track, beyond what the bearings' covariances "
+            "tell [-]",
             "range": (0.0, 0.1),
+        },
+    )
+    lasting_share: float = field(
+        default=1.0,
+        metadata={
+            "description": "share of the bearings' variance along the parallax that lasts over a track: at 1 "
+            "a depth is known no better than the best single view tells it, however many there are [-]",
+            "range": (0.0, 1.0),
         },
     )
     max_pose_age: float = field(

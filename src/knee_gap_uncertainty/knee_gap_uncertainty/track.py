@@ -113,7 +113,10 @@ class Track:
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
             return self._told(blank, view, flaw)
-        fitted = with_depth_drift(fitted, self._first.lens, self._parameters.depth_drift)
+        parameters = self._parameters
+        fitted = with_depth_drift(
+            fitted, views, self._first.lens, parameters.depth_drift, parameters.lasting_share
+        )
         if self._calibration is not None:
             fitted = self._calibration.widened(fitted, views)
         try:
