@@ -165,7 +165,6 @@ class Patch:
         fall = np.exp(-(line**2) / (2 * (WINDOW * half_size) ** 2))
         window = np.outer(fall, fall)
         self.weight = (seen * window).astype(np.float32)
-        self.coverage = float(self.weight.sum() / window.sum())
         dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
         dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
         # Neighbours tell nearly the same: every other pixel of every other line costs no accuracy.

@@ -19,7 +19,8 @@ STEP = 2  # [px] between the pixels that are looked at
 class TissueTexture:
     """Texture of the square around a pixel, taken once for all places that are judged in it.
 
-    A place is judged by what a patch around it could tell about a shift, as `Patch` would take it.
+    A place is judged by what a patch around it could tell about a shift, much as `Patch` would take it;
+    but what is a highlight is told from the light of the whole square.
     """
 
     def __init__(self, grey: Image, centre: Array, reach: float, half_size: int, dark_below: float) -> None:
@@ -39,13 +40,16 @@ class TissueTexture:
     def information(self, pixel: Array, limit: float = float("inf")) -> tuple[Array, float]:
         """Structure tensor (2, 2) [1/px^2] at a pixel (2,), and the share of the patch there that is tissue.
 
+        Only every other pixel of every other line is summed up.
+
         Of a block of the patch it takes no more than `limit` times what the median block says. Raises
         PerceptionError for a pixel outside the square.
         """
-        column, row = np.rint(pixel - np.array(self._surface.origin)).astype(int) - self._half_size
-        side = 2 * self._half_size + 1
-        if min(row, column) < 0 or max(row, column) + side > self._surface.weight.shape[0]:
+        corner = np.rint(pixel - np.array(self._surface.origin)) - self._half_size
+        last = self._surface.weight.shape[0] - (2 * self._half_size + 1)
+        if not ((corner >= 0) & (corner <= last)).all():
             raise PerceptionError(f"the pixel {pixel} lies outside the square that was taken")
+        column, row = corner.astype(int)
         blocks, weight = block_tensors(
             self._dx, self._dy, self._surface.weight, self._window, (int(row), int(column)), STEP, BLOCKS
         )

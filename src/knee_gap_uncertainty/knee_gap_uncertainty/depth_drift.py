@@ -8,7 +8,7 @@ considered: each point's covariance grows along the ray from the first lens.
 
 How large that share is, the bearings' own covariances tell best: they differ between a rim and a contour, and
 where little texture is shared it is the registrations themselves that are wrong in the same way. So of what
-the best single view leaves open of a point's depth a share of the variance lasts, however many views there
+the best single views leave open of a point's depth a share of the variance lasts, however many views there
 are; what the covariances do not tell comes on top.
 """
 
@@ -22,9 +22,11 @@ from knee_gap_uncertainty.views import Views
 
 Array = npt.NDArray[np.float64]
 
-
 # [rad] by which a bearing would turn were its point at the first lens: below it a view tells no depth.
 LEAST_TURN = 1e-4
+# Share of the views that may claim to tell a depth better: one whose error is said to be nothing must not
+# speak for all.
+TOO_GOOD = 0.1
 
 
 def with_depth_drift(
@@ -34,11 +36,14 @@ def with_depth_drift(
 
     `first_lens` (3,) [m] is the lens of the track's first view; `drift` [-] the standard deviation of the
     share that no covariance tells, independent in both points; `lasting_share` [-] the share of the variance
-    of the best of the `views` that lasts over a track. With none of both the fit is returned as it is.
+    that the best of the `views` leave open and that lasts over a track. With none of both, and where a point
+    lies at infinity, the fit is returned as it is.
     """
     if not ((drift > 0.0 or lasting_share > 0.0) and np.isfinite(fit.points).all()):
         return fit
-    variances = drift**2 + lasting_share * np.square(single_view_drift(fit, views, first_lens))
+    variances = np.full(2, drift**2)
+    if lasting_share > 0.0:
+        variances += lasting_share * fit.scale * np.square(single_view_drift(fit, views, first_lens))
     added = np.zeros((6, 6))
     for n in range(2):
         ray = fit.points[n] - first_lens
@@ -47,21 +52,30 @@ def with_depth_drift(
 
 
 def single_view_drift(fit: MultiViewFit, views: Views, first_lens: Array) -> Array:
-    """Standard deviation (2,) [-] of the drift of each point that the best single view leaves open.
+    """Standard deviation (2,) [-] of the drift of each point that one of the best views leaves open.
 
-    A drift by a share s turns the bearing of a view by s times the ray from the first lens, across the
-    bearing and against the distance. At most 1: with no parallax at all, nothing is known.
+    `first_lens` (3,) [m] is the lens of the track's first view. A drift by a share s turns the bearing of a
+    view by s times the ray from the first lens, across the bearing and against the distance; the bearing's
+    error beside that turn is unknown as well. It is the first decile over the views that tell any. At most
+    1: with no parallax at all, nothing is known.
     """
     rays = fit.points - first_lens
     sights = fit.points - views.lens_positions[:, None]
     distances = np.linalg.norm(sights, axis=-1, keepdims=True)
     bearings = sights / distances
     turned = (rays - np.sum(rays * bearings, axis=-1, keepdims=True) * bearings) / distances
-    size = np.sum(turned * turned, axis=-1)
-    spread = np.einsum("vni,vnij,vnj->vn", turned, views.bearing_covariances, turned)
-    told = fit.used & (size > LEAST_TURN**2)
-    variances = np.divide(spread, size**2, out=np.ones_like(size), where=told)
-    return np.asarray(np.sqrt(np.minimum(variances.min(axis=0), 1.0)))
+    size = np.linalg.norm(turned, axis=-1)
+    told = fit.used & (size > LEAST_TURN)
+    towards = turned / np.where(told, size, 1.0)[..., None]
+    beside = np.cross(bearings, towards)
+    own, both, other = (
+        np.einsum("vni,vnij,vnj->vn", a, views.bearing_covariances, b)
+        for a, b in ((towards, towards), (towards, beside), (beside, beside))
+    )
+    spread = own - np.divide(both**2, other, out=np.zeros_like(own), where=other > 0.0)
+    variances = np.divide(spread, size**2, out=np.ones_like(size), where=told).clip(0.0, 1.0)
+    best = [np.quantile(variances[told[:, n], n], TOO_GOOD) if told[:, n].any() else 1.0 for n in range(2)]
+    return np.sqrt(np.array(best))
 
 
 def widened(fit: MultiViewFit, added: Array) -> MultiViewFit:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from knee_gap_node.parameter_rules import broken_rule
 from knee_gap_uncertainty.confidence_interval import confidence_interval
+from knee_gap_uncertainty.depth_drift import with_depth_drift
 from knee_gap_uncertainty.errors import BadInputError, MeasurementError
 from knee_gap_uncertainty.gap_range import gap_range
 from knee_gap_uncertainty.multi_view import fit
@@ -74,7 +75,7 @@ class Situation(NamedTuple):
     `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
     coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad] and `translation_error`
     [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
-    vector of the present travel.
+    vector of the present travel. `depth_drift` and `lasting_share` are the estimator's.
     """
 
     stamp_ns: int
@@ -91,6 +92,8 @@ class Situation(NamedTuple):
     apex: Literal["first", "second", "best"]
     confidence_level: float
     views: Views
+    depth_drift: float = 0.0
+    lasting_share: float = 0.0
 
 
 class Prospect(NamedTuple):
@@ -142,9 +145,13 @@ def snr_after(situation: Situation, offset: Floats) -> float:
 def width_after(situation: Situation, offset: Floats) -> float:
     """Width of the confidence interval [m] `offset` (3,) [m] further on; infinite where refused."""
     try:
-        fitted = fit(views_after(situation, offset))
+        views = views_after(situation, offset)
+        fitted = fit(views)
     except MeasurementError:
         return inf
+    fitted = with_depth_drift(
+        fitted, views, situation.first_lens, situation.depth_drift, situation.lasting_share
+    )
     interval = confidence_interval(fitted, situation.confidence_level)
     return interval.upper - interval.lower
 

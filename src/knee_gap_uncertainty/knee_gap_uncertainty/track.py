@@ -192,6 +192,8 @@ class Track:
             apex=self._parameters.apex,
             confidence_level=self._parameters.confidence_level,
             views=all_views.views,
+            depth_drift=self._parameters.depth_drift,
+            lasting_share=self._parameters.lasting_share,
         )
 
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.field_of_view import FieldOfViewFinder, find_field_of_view
+from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, find_field_of_view
 
 Image = npt.NDArray[np.uint8]
 
@@ -82,6 +82,16 @@ def test_mask_agrees_with_depth() -> None:
     full, quarter = field.mask((720, 1280)), field.mask((180, 320), 0.25)
     assert full.sum() == pytest.approx(np.pi * field.radius**2, rel=0.002)
     assert 16 * quarter.sum() == pytest.approx(full.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("margin", [0.0, 40.0, 400.0, -5.0])
+@pytest.mark.parametrize("radius", [350.0, 500.0, np.inf])
+def test_mask_is_what_lies_deep_enough(radius: float, margin: float) -> None:
+    """Of a disc, of one that the box cuts, and of the box alone."""
+    field = FieldOfView((637.5, 351.0), radius, (12.0, 30.0, 1270.0, 690.0))
+    rows, columns = np.mgrid[:180, :320]
+    depth = field.depth_inside((np.stack([columns, rows], axis=-1) + 0.5) / 0.25 - 0.5)
+    np.testing.assert_array_equal(field.mask((180, 320), 0.25, margin), depth > margin)
 
 
 def test_stream_keeps_the_disc_through_dark_images_and_finds_a_new_one_for_a_new_size() -> None:

@@ -22,11 +22,11 @@ NOTHING = np.zeros((180, 320), bool)
 
 
 def _gap() -> np.ndarray:
-    """Tissue (720, 1280) above and below a dark gap of rows 300 to 420, with texture about the section."""
+    """Textured tissue (720, 1280) above and below a dark gap of rows 300 to 420; richest at the section."""
     rng = np.random.default_rng(5)
     detail = cv2.GaussianBlur(rng.standard_normal((720, 1280)), (0, 0), 3.0)
     columns = np.arange(1280)
-    richness = 0.5 + 10.0 * np.exp(-(((columns - 640.0) / 30.0) ** 2))
+    richness = 4.0 + 8.0 * np.exp(-(((columns - 640.0) / 15.0) ** 2))
     image = 130.0 + richness * detail / detail.std()
     image[300:420] = 20.0
     return np.clip(image, 0, 255).astype(np.uint8)

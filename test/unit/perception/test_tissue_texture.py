@@ -42,6 +42,15 @@ def test_lines_tell_of_a_shift_across_them_only():
     assert abs(information[0, 1]) < 0.01 * information[1, 1]
 
 
+def test_slanted_lines_tell_of_a_shift_across_them_only():
+    rows, columns = np.mgrid[:256, :256]
+    lines = 120.0 + 12.0 * np.sin((rows * np.cos(0.5) + columns * np.sin(0.5)) / 3.0)
+    information, _ = _taken(lines).information(CENTRE)
+    values, axes = np.linalg.eigh(information)
+    assert values[1] > 50.0 * values[0]
+    assert abs(axes[:, 1] @ [np.sin(0.5), np.cos(0.5)]) > 0.999
+
+
 def test_a_place_beside_the_gap_has_less_tissue_than_one_amid_it():
     tissue = _tissue(np.random.default_rng(2), 12.0)
     tissue[150:] = 5.0
@@ -58,7 +67,8 @@ def test_the_farthest_places_are_whole(pixel):
     assert np.isfinite(information).all()
 
 
-def test_a_place_outside_is_refused():
+@pytest.mark.parametrize("away", [60.0, np.nan, np.inf])
+def test_a_place_outside_is_refused(away):
     texture = _taken(_tissue(np.random.default_rng(3), 12.0))
     with pytest.raises(PerceptionError, match="outside the square"):
-        texture.information(CENTRE + np.array([60.0, 0.0]))
+        texture.information(CENTRE + np.array([away, 0.0]))

@@ -66,6 +66,19 @@ def test_one_estimate_an_image_and_exact_for_exact_views() -> None:
     assert 20 <= last.view_count <= 60  # views that are too close to others are not kept
 
 
+def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> None:
+    positions = list(np.linspace(0.0, 0.006, 120))
+    widths = []
+    for drift, share in ((0.0, 0.0), (0.002, 0.0), (0.002, 1.0)):
+        parameters = EstimatorParameters(depth_drift=drift, lasting_share=share)
+        last = run(GapEstimator(parameters), positions)[-1]
+        assert last.status is GapStatus.VALID
+        widths.append(last.confidence_max - last.confidence_min)
+    assert widths[0] < 0.99 * widths[1] < 0.98 * widths[2]
+    default = run(GapEstimator(), positions)[-1]
+    assert default.confidence_max - default.confidence_min == pytest.approx(widths[2])
+
+
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
     estimate = run(GapEstimator(), [0.0, 0.003, 0.005])[-1]
     first, now = edges(0, 0.0), edges(0, 0.005)

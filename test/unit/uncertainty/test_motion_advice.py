@@ -117,6 +117,13 @@ def test_width_of_the_interval_as_target() -> None:
     assert width_after(now, 0.7 * found.travel * SIDEWAYS) > target
 
 
+def test_a_width_that_is_promised_has_in_it_what_lasts_over_a_track() -> None:
+    offset = 0.004 * SIDEWAYS
+    plain = width_after(situation(), offset)
+    assert width_after(situation()._replace(lasting_share=1.0), offset) > 1.05 * plain
+    assert width_after(situation()._replace(depth_drift=0.02), offset) > 1.05 * plain
+
+
 def test_value_that_rises_and_falls_is_not_bisected_over_its_peak() -> None:
     peak = [
         found for found in scan(lambda t: 5.0 - abs(t - 0.003) * 1e3, 4.9, 0.01, more_is_better=True) if found
