@@ -75,7 +75,7 @@ def single_view_drift(fit: MultiViewFit, views: Views, first_lens: Array) -> Arr
     spread = own - np.divide(both**2, other, out=np.zeros_like(own), where=other > 0.0)
     variances = np.divide(spread, size**2, out=np.ones_like(size), where=told).clip(0.0, 1.0)
     best = [np.quantile(variances[told[:, n], n], TOO_GOOD) if told[:, n].any() else 1.0 for n in range(2)]
-    return np.sqrt(np.array(best))
+    return np.asarray(np.sqrt(best))
 
 
 def widened(fit: MultiViewFit, added: Array) -> MultiViewFit:
