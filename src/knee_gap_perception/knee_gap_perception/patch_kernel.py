@@ -206,7 +206,13 @@ def _reweighted(patch: Float32, change: Array) -> Float32:
 
 
 def _block_tensors(
-    dx: Float32, dy: Float32, weight: Float32, window: Array, corner: tuple[int, int], step: int, blocks: int
+    dx: Float32,
+    dy: Float32,
+    weight: Float32,
+    window: Float32,
+    corner: tuple[int, int],
+    step: int,
+    blocks: int,
 ) -> tuple[Array, float]:
     """Structure tensors (blocks^2, 3) as xx, xy, yy of a square of gradients (h, w), and its weight.
 
@@ -241,5 +247,5 @@ structures: Callable[[Float32, Float32, Float32, Array, int], tuple[Array, Array
 )
 reweighted: Callable[[Float32, Array], Float32] = numba.njit(cache=True)(_reweighted)
 block_tensors: Callable[
-    [Float32, Float32, Float32, Array, tuple[int, int], int, int], tuple[Array, float]
+    [Float32, Float32, Float32, Float32, tuple[int, int], int, int], tuple[Array, float]
 ] = numba.njit(cache=True)(_block_tensors)

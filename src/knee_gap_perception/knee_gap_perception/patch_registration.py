@@ -150,6 +150,19 @@ def _noise(raw: Float32, surface: npt.NDArray[Any]) -> float:
     return float(np.sqrt(np.pi / 2) / 6 * rough.mean()) if rough.size else 0.0
 
 
+def patch_window(half_size: int) -> Float32:
+    """Weight of the places of a patch (n, n) of a half size [px]: most in its middle."""
+    line = np.arange(-half_size, half_size + 1, dtype=np.float32)
+    fall = np.exp(-(line**2) / (2 * (WINDOW * half_size) ** 2))
+    return np.outer(fall, fall)
+
+
+def gradients(texture: Float32) -> tuple[Float32, Float32]:
+    """Derivatives of a texture (h, w) along x and y [1/px]."""
+    dx, dy = (cv2.Sobel(texture, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    return np.asarray(dx, np.float32), np.asarray(dy, np.float32)
+
+
 class Patch:
     """A piece of surface around a point, ready to be found in other images."""
 
@@ -161,12 +174,8 @@ class Patch:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         self.texture = cv2.warpAffine(surface.texture, matrix, (side, side), flags=flags).astype(np.float32)
         seen = cv2.warpAffine(surface.weight, matrix, (side, side), flags=flags)
-        line = np.arange(-half_size, half_size + 1, dtype=np.float32)
-        fall = np.exp(-(line**2) / (2 * (WINDOW * half_size) ** 2))
-        window = np.outer(fall, fall)
-        self.weight = (seen * window).astype(np.float32)
-        dx = cv2.Sobel(self.texture, cv2.CV_32F, 1, 0, scale=1 / 8)
-        dy = cv2.Sobel(self.texture, cv2.CV_32F, 0, 1, scale=1 / 8)
+        self.weight = (seen * patch_window(half_size)).astype(np.float32)
+        dx, dy = gradients(self.texture)
         # Neighbours tell nearly the same: every other pixel of every other line costs no accuracy.
         sparse = (np.indices((side, side)) % 2 == 0).all(axis=0)
         self._pixels = np.stack([self.texture, dx, dy, self.weight * sparse], axis=-1).astype(np.float32)

@@ -1,12 +1,17 @@
 """How much texture the places of a piece of tissue have, to follow a point by."""
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.patch_kernel import block_tensors
-from knee_gap_perception.patch_registration import BLOCKS, LOCAL_MEAN, WINDOW, surface_around
+from knee_gap_perception.patch_registration import (
+    BLOCKS,
+    LOCAL_MEAN,
+    gradients,
+    patch_window,
+    surface_around,
+)
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -29,21 +34,16 @@ class TissueTexture:
         Grey levels below `dark_below` are no tissue.
         """
         surface = surface_around(grey, centre, int(np.ceil(reach)) + half_size + MARGIN, dark_below)
-        self._dx = np.asarray(cv2.Sobel(surface.texture, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
-        self._dy = np.asarray(cv2.Sobel(surface.texture, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
+        self._dx, self._dy = gradients(surface.texture)
         self._surface, self._half_size = surface, half_size
         # Neighbours tell nearly the same.
-        line = np.arange(-half_size, half_size + 1, STEP, dtype=np.float64)
-        fall = np.exp(-(line**2) / (2 * (WINDOW * half_size) ** 2))
-        self._window = np.outer(fall, fall)
+        self._window = np.ascontiguousarray(patch_window(half_size)[::STEP, ::STEP])
 
     def information(self, pixel: Array, limit: float = float("inf")) -> tuple[Array, float]:
         """Structure tensor (2, 2) [1/px^2] at a pixel (2,), and the share of the patch there that is tissue.
 
-        Only every other pixel of every other line is summed up.
-
-        Of a block of the patch it takes no more than `limit` times what the median block says. Raises
-        PerceptionError for a pixel outside the square.
+        Only every other pixel of every other line is summed up. Of a block of the patch it takes no more than
+        `limit` times what the median block says. Raises PerceptionError for a pixel outside the square.
         """
         corner = np.rint(pixel - np.array(self._surface.origin)) - self._half_size
         last = self._surface.weight.shape[0] - (2 * self._half_size + 1)
