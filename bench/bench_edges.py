@@ -107,7 +107,9 @@ class GapCheck:
     def add(self, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
         """Hand an image's edges and pose to the estimator, as messages, and score what comes out."""
         posed = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), pose)
-        seen = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+        seen = fill_gap_edges(
+            blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
+        )
         now = edges.stamp_ns
         estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
         estimates += self._estimator.add_edges(messages.edges_from_message(seen), now)

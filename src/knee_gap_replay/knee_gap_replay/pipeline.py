@@ -237,7 +237,9 @@ class GapPipeline:
 
     def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output]:
         for edges in images:
-            edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+            edges_message = fill_gap_edges(
+                blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
+            )
             yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
             if self._with_mask and (mask := self._detector.mask()) is not None:
                 yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)

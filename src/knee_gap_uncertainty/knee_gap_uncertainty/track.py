@@ -234,7 +234,7 @@ class Track:
             confidence_max=interval.upper,
             parallax=parallax,
             view_count=fitted.view_count,
-            shares=fitted.shares,
+            shares=np.append(fitted.shares, [0.0, 0.0]),
         )
         if self._joint_motion.still_count < FEWEST_VIEWS_TO_CHECK:
             return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
