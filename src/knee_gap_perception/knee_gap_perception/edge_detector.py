@@ -231,9 +231,7 @@ class GapEdgeDetector:
         if profile:
             self._profile_ns = stamp_ns
         foreign, scale = self._search.foreign(picture)
-        return self._track.edges.find(
-            stamp_ns, grey, foreign, scale, field, camera, pixels, profile=profile
-        )
+        return self._track.edges.find(stamp_ns, grey, foreign, scale, field, camera, pixels, profile=profile)
 
     def _settle_frame(self, pose_frame: str) -> None:
         """Let the track be begun anew where it cannot use poses in a frame.

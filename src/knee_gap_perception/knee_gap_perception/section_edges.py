@@ -22,8 +22,8 @@ Mask = npt.NDArray[np.bool_]
 
 ROW_STEP = 4.0  # [px] along the opening between the lines on which its borders are looked for
 BEYOND = 24  # [px] beyond a tracked point to which its border may lie
-# Share of the way from the gap's brightness to the tissue's at which tissue begins. Light grazes a smooth bone
-# beside its contour, so tissue is dim there: half of the way would place the border inside the tissue.
+# Share of the way from the gap's brightness to the tissue's at which tissue begins. Light grazes a smooth
+# bone beside its contour, so tissue is dim there: half of the way would place the border inside the tissue.
 TISSUE_BEGINS = 0.25
 # The same shares for where tissue begins at the earliest and at the latest.
 EARLIEST, LATEST = 0.12, 0.5
@@ -45,8 +45,8 @@ STATION_STEP = 0.6  # of the circle's radius between two of them
 class Borders(NamedTuple):
     """Where tissue begins on lines across the opening, to one side: distances (n,) from the centre [px].
 
-    `earliest` and `latest` (n,) enclose `place`. `known` is false for a line whose border is not seen: covered,
-    or beyond where it was looked for; the border then lies at `place` or farther out.
+    `earliest` and `latest` (n,) enclose `place`. `known` is false for a line whose border is not seen:
+    covered, or beyond where it was looked for; the border then lies at `place` or farther out.
     """
 
     place: Array
@@ -193,7 +193,8 @@ class SectionEdgeFinder:
             columns = strip.middle + (sign * np.arange(length)).astype(int)
             lines = strip.values[:, columns].astype(np.float64)
             place, earliest, latest = (
-                _last_below(lines, gap + share * (tissue - gap)) for share in (TISSUE_BEGINS, EARLIEST, LATEST)
+                _last_below(lines, gap + share * (tissue - gap))
+                for share in (TISSUE_BEGINS, EARLIEST, LATEST)
             )
             ends = centre + sign * place[:, None] * self._across + strip.rows[:, None] * along
             column, row = np.rint((ends + 0.5) * scale - 0.5).astype(int).T
@@ -216,7 +217,7 @@ class SectionEdgeFinder:
             borderMode=cv2.BORDER_REPLICATE,
         )
         values = np.asarray(cv2.blur(values, (3, 3)), np.uint8)
-        return _Strip(values, ROW_STEP * np.arange(-count, count + 1), width)
+        return _Strip(values, ROW_STEP * np.arange(-count, count + 1, dtype=np.float64), width)
 
     def _gap_level(self, strip: _Strip, half: float) -> float:
         """Brightness of the opening's middle."""
@@ -264,9 +265,7 @@ class SectionEdgeFinder:
             else:
                 states.append(EdgeState.SEEN)
         bearings = camera.bearings(pixels)
-        steps = [
-            float(np.linalg.norm(bearing_jacobian(camera, pixel) @ self._across)) for pixel in pixels
-        ]
+        steps = [float(np.linalg.norm(bearing_jacobian(camera, pixel) @ self._across)) for pixel in pixels]
         angles = np.array(deviations) * steps
         if not (np.isfinite(bearings).all() and np.isfinite(angles).all()) or circle.radius < 2.0:
             return SectionEdges()
@@ -283,7 +282,9 @@ class SectionEdgeFinder:
     def _insets_of(self, circle: Circle, points: Array, centre: Array) -> Array:
         """How far (2,) [px] each tracked point lies beyond its edge, across the opening."""
         places = (points - centre) @ self._across
-        return np.array([circle.offset - circle.radius - places[0], places[1] - circle.offset - circle.radius])
+        return np.array(
+            [circle.offset - circle.radius - places[0], places[1] - circle.offset - circle.radius]
+        )
 
     def _plausible(self, stamp_ns: int, insets: Array) -> bool:
         """Whether the edges are where those of the last image lead one to expect them."""
@@ -328,5 +329,7 @@ def _last_below(lines: Array, threshold: float) -> Array:
     index = np.clip(last, 0, count - 2)
     row = np.arange(len(lines))
     before, after = lines[row, index], lines[row, index + 1]
-    share = np.where(after > before, (threshold - before) / np.where(after > before, after - before, 1.0), 0.0)
+    share = np.where(
+        after > before, (threshold - before) / np.where(after > before, after - before, 1.0), 0.0
+    )
     return np.where(inside, index + share, np.where(last < 0, 0.0, float(count - 1)))

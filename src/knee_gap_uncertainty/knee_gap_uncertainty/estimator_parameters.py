@@ -102,6 +102,14 @@ class EstimatorParameters:
             "range": (0.001, 1.0),
         },
     )
+    longest_unseen_edges: float = field(
+        default=0.7,
+        metadata={
+            "description": "how long the edges of the opening are carried on, with growing errors, while no "
+            "image shows them beside the points [s]",
+            "range": (0.0, 10.0),
+        },
+    )
     leg_motion: float = field(
         default=0.0,
         metadata={

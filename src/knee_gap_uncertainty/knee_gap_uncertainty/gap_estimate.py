@@ -36,8 +36,8 @@ class EdgeState(IntEnum):
 class EdgeSection:
     """The two edges of the opening at one section of it, in the lens frame of one image.
 
-    `bearings` (2, 3) unit vectors; `deviations` (2,), the standard deviation of each across the opening [rad];
-    `error` bounds the larger error [rad]. Numbers of an edge that is not seen are NaN.
+    `bearings` (2, 3) unit vectors; `deviations` (2,), the standard deviation of each across the opening
+    [rad]; `error` bounds the larger error [rad]. Numbers of an edge that is not seen are NaN.
     """
 
     states: tuple[int, int] = (EdgeState.UNKNOWN, EdgeState.UNKNOWN)

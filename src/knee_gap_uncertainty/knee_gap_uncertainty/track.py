@@ -5,7 +5,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
+from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS
 from knee_gap_uncertainty.calibration_fit import explained_by
 from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.depth_drift import with_depth_drift
@@ -19,12 +21,15 @@ from knee_gap_uncertainty.errors import (
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.instrument_gap import Edges, flaw_of, instrument_gap, opening_of, worst_case
 from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration import CalibrationError
+from knee_gap_uncertainty.section_edges import AT_BORDER, SectionInView
+from knee_gap_uncertainty.translation_volume import displacements
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
@@ -78,6 +83,7 @@ class Track:
         self._recent: deque[PosedView] = deque()
         self._direction = np.full(3, np.nan)
         self._joint_motion = JointMotionTest()
+        self._section = SectionInView(parameters.longest_unseen_edges)
         self.ended = False
         # The last image that was found still, where the window does not keep it.
         self._passing: Views | None = None
@@ -126,7 +132,7 @@ class Track:
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
             return self._told(blank, view, REASONS.get(type(error), str(error)))
-        return self._measured(blank, view, bounds, parallax, all_views)
+        return self._measured(blank, edges, view, bounds, parallax, all_views)
 
     def _views_with(self, present: Views) -> Views:
         """The views kept and then the present one, which is not kept before it has been found to fit them."""
@@ -222,37 +228,76 @@ class Track:
         return angle + shared[0], position + shared[1]
 
     def _measured(
-        self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews
+        self,
+        blank: GapEstimate,
+        observation: EdgeObservation,
+        view: PosedView,
+        bounds: GapRange,
+        parallax: float,
+        all_views: AllViews,
     ) -> GapEstimate:
+        """The estimate from the points' bounds and fit, and from the edges beside them in this image."""
         _, fitted, interval = all_views
-        estimate = replace(
+        points = replace(
             self._told(blank, view, ""),
-            gap_min=bounds.gap_min,
-            gap_max=bounds.gap_max,
-            snr=0.0,
-            confidence_min=interval.lower,
-            confidence_max=interval.upper,
+            point_distance_min=bounds.gap_min,
+            point_distance_max=bounds.gap_max,
+            point_distance_confidence_min=interval.lower,
+            point_distance_confidence_max=interval.upper,
             parallax=parallax,
             view_count=fitted.view_count,
-            shares=np.append(fitted.shares, [0.0, 0.0]),
         )
+        distances = np.linalg.norm(fitted.points - view.lens, axis=1)
+        edges = self._section.at(observation, view, float(np.nanmin(distances, initial=np.inf)))
+        if isinstance(edges, str):
+            return replace(points, status=GapStatus.NO_EDGES, reason=edges)
+        opening = opening_of(view.bearings, edges.bearings)
+        if flaw := flaw_of(opening):
+            return replace(points, status=GapStatus.NO_EDGES, reason=flaw)
+        gap_min, gap_max = self._worst_case(view, edges)
+        estimate = replace(points, gap_min=gap_min, gap_max=gap_max, snr=0.0)
+        if not edges.bounded:
+            return replace(estimate, status=GapStatus.NO_EDGES, gap_max=np.inf, reason=AT_BORDER)
         if self._joint_motion.still_count < FEWEST_VIEWS_TO_CHECK:
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
-        if not np.isfinite(bounds.gap_max):
-            return replace(estimate, reason=UNBOUNDED)
+            return _unbounded(estimate, UNCHECKED)
+        if not (np.isfinite(bounds.gap_max) and np.isfinite(gap_max)):
+            return _unbounded(estimate, UNBOUNDED)
         if interval.refused or not np.isfinite(fitted.gap):
             # The lower bounds stand; an upper one must not be taken for an answer.
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCERTAIN_DEPTH)
-        if fitted.gap > self._parameters.largest_gap:
+            return _unbounded(estimate, UNCERTAIN_DEPTH)
+        radius = float(norm.ppf(0.5 + 0.5 * self._parameters.confidence_level))
+        found = instrument_gap(fitted, view.lens, opening, edges, radius)
+        if found.gap > self._parameters.largest_gap:
             return replace(self._told(blank, view, TOO_LARGE), status=GapStatus.UNKNOWN)
-        if not bounds.gap_min <= fitted.gap <= bounds.gap_max:
+        if not (bounds.gap_min <= fitted.gap <= bounds.gap_max and gap_min <= found.gap <= gap_max):
             return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
         return replace(
             estimate,
             status=GapStatus.VALID,
-            gap=fitted.gap,
-            snr=fitted.gap / (bounds.gap_max - bounds.gap_min),
+            gap=found.gap,
+            snr=found.gap / (gap_max - gap_min),
+            confidence_min=found.lower,
+            confidence_max=found.upper,
+            instrument_point=found.point,
+            instrument_axis=found.axis,
+            point_distance=fitted.gap,
             points=fitted.points,
+            shares=np.append(fitted.shares * (1.0 - found.shares.sum()), found.shares),
+        )
+
+    def _worst_case(self, present: PosedView, edges: Edges) -> tuple[float, float]:
+        """Bounds [m] of the instrument gap from the first view and the present one with its edges."""
+        assert self._first is not None
+        angular_error, translation_error = self._error_bounds(self._first, present)
+        return worst_case(
+            self._first.lens - present.lens,
+            present.bearings,
+            self._first.bearings,
+            opening_of(present.bearings, edges.bearings),
+            edges,
+            angular_error,
+            displacements(translation_error, 1),
+            SIGNS[INTERVAL_SIGNS[self._parameters.interval]],
         )
 
     def _told(self, blank: GapEstimate, view: PosedView, reason: str) -> GapEstimate:
@@ -260,3 +305,15 @@ class Track:
         assert self._first is not None
         baseline = float(np.linalg.norm(view.lens - self._first.lens))
         return replace(blank, baseline=baseline, view_count=len(self._window), reason=reason)
+
+
+def _unbounded(estimate: GapEstimate, reason: str) -> GapEstimate:
+    """The estimate with its lower bounds only."""
+    return replace(
+        estimate,
+        gap_max=np.inf,
+        confidence_max=np.inf,
+        point_distance_max=np.inf,
+        point_distance_confidence_max=np.inf,
+        reason=reason,
+    )
