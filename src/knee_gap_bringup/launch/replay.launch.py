@@ -30,6 +30,7 @@ OUTPUTS = (
     "gap/min",
     "gap/max",
     "gap/snr",
+    "gap_profile",
     "motion_advice",
 )
 # Time for the last image to pass through the nodes [s].

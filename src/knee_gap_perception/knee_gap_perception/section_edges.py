@@ -216,8 +216,8 @@ class SectionEdgeFinder:
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        values = np.asarray(cv2.blur(values, (3, 3)), np.uint8)
-        return _Strip(values, ROW_STEP * np.arange(-count, count + 1, dtype=np.float64), width)
+        smooth = np.asarray(cv2.blur(values, (3, 3)), np.uint8)
+        return _Strip(smooth, ROW_STEP * np.arange(-count, count + 1.0), width)
 
     def _gap_level(self, strip: _Strip, half: float) -> float:
         """Brightness of the opening's middle."""

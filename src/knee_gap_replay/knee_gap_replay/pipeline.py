@@ -148,6 +148,7 @@ class GapPipeline:
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
             self._topic("gap"): ("knee_gap_msgs/msg/GapEstimate", "reliable"),
+            self._topic("gap_profile"): ("knee_gap_msgs/msg/GapProfile", "reliable"),
             self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
             **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
         }
@@ -255,6 +256,11 @@ class GapPipeline:
                     number = blank("std_msgs/msg/Float64")
                     number.data = float(getattr(estimate, attribute))
                     yield Output(self._topic(name), number, estimate.stamp_ns)
+
+        while self._estimator.profiles:
+            profile = self._estimator.profiles.popleft()
+            message = messages.fill_gap_profile(blank("knee_gap_msgs/msg/GapProfile"), profile)
+            yield Output(self._topic("gap_profile"), message, profile.stamp_ns)
 
     def _advice(self) -> Iterator[Output]:
         while self._estimator.advice:

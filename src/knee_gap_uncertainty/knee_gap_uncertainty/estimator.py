@@ -15,6 +15,7 @@ from knee_gap_uncertainty.advice_task import PIECES, AdviceTask
 from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.gap_profile import GapProfile
 from knee_gap_uncertainty.leg_body import LegBody
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
@@ -35,7 +36,7 @@ NO_NUMBERS = "the views, or the calibration's error, cannot be calculated with"
 POSES_OF_DELAY = 32
 LATE = "the image came too long after the lens poses of its time"
 
-# Advice that nobody has taken yet.
+# Advice, and profiles, that nobody has taken yet.
 MOST_ADVICE = 16
 
 
@@ -49,7 +50,8 @@ class Pending(NamedTuple):
 class GapEstimator:
     """Fuses edges and lens poses into one estimate an image, in the order of the images.
 
-    Advice on motion is made while time passes; whoever wants it takes it from `advice`.
+    Advice on motion is made while time passes and is taken from `advice`; `profiles` are those of the images
+    that show more sections of the opening.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class GapEstimator:
     ) -> None:
         self.parameters = parameters or EstimatorParameters()
         self.advice: deque[MotionAdvice] = deque(maxlen=MOST_ADVICE)
+        self.profiles: deque[GapProfile] = deque(maxlen=MOST_ADVICE)
         self._advice_task = AdviceTask(advice)
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
@@ -252,6 +255,8 @@ class GapEstimator:
         except (MeasurementError, ArithmeticError, ValueError):
             self._track = None
             return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, NO_NUMBERS)
+        if self._track.profile is not None:
+            self.profiles.append(self._track.profile)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))
 

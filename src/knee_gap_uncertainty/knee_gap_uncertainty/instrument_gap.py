@@ -166,6 +166,19 @@ def instrument_gap(
     )
 
 
+def widest_gap(points: Array, lens: Array, opening: Opening, edges: Edges) -> float:
+    """The instrument gap [m] beside points (2, 3) [m] that a lens (3,) [m] sees, without an interval."""
+    ranges = np.linalg.norm(points - lens, axis=1) * opening.in_plane
+    return float(widest(opening.half, ranges, opening.insets, *edges.shapes, TILTS)[0])
+
+
+def edge_points(lens: Array, points: Array, opening: Opening, edges: Edges) -> Array:
+    """Where the lines of sight along both edges touch the tissue (2, 3) [m], by the mean of the shapes."""
+    ranges = np.linalg.norm(points - lens, axis=1) * opening.in_plane
+    beyond = [mean_farther(float(ranges[n]), float(opening.insets[n]), edges.shapes[n]) for n in range(2)]
+    return np.asarray(lens + (ranges + beyond)[:, None] * edges.bearings)
+
+
 def _ends(
     ranges: Array, covariance: Array, radius: float, opening: Opening, edges: Edges, tilt: float
 ) -> tuple[float, float, float]:
@@ -225,12 +238,32 @@ def worst_case(
     clouds. Both points are seen from the same two lenses, so they share the displacements. The greatest gap
     is infinite where a point may lie at infinity; the least is 0 where nothing bounds it from below.
     """
+    near, far = admitted_ranges(travel, present, first, opening, angular_error, shifts, signs)
+    return bounds_of_gap(near, far, opening, edges, angular_error)
+
+
+def admitted_ranges(
+    travel: Array,
+    present: Array,
+    first: Array,
+    opening: Opening,
+    angular_error: float,
+    shifts: Array,
+    signs: Array,
+) -> tuple[Array, Array]:
+    """Least and greatest distance (m, 2) [m] of the points in the plane of the section; as `worst_case`."""
     near, far = ranges_under_errors(
         np.ascontiguousarray(travel), present, first, angular_error, shifts, signs
     )
+    return near * opening.in_plane, far * opening.in_plane
+
+
+def bounds_of_gap(
+    near: Array, far: Array, opening: Opening, edges: Edges, angular_error: float
+) -> tuple[float, float]:
+    """Least and greatest instrument gap [m] for the distances of `admitted_ranges`; as `worst_case`."""
     if not near.size:
         return 0.0, np.inf
-    near, far = near * opening.in_plane, far * opening.in_plane
     narrower = edges.error - angular_error
     lower = least_gap(
         near,
@@ -257,6 +290,17 @@ def side(distance: float, angle: float, inset: float, radius: float, slope: floa
     beside = distance * np.sin(max(inset, 0.0))
     farther = np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
     return float((distance + farther) * np.sin(angle) - radius * (1.0 - np.cos(angle)))
+
+
+@compiled
+def mean_farther(distance: float, inset: float, shapes: Array) -> float:
+    """How much farther [m] an edge lies than the point beside it, as a mean over the shapes (n, 2)."""
+    total = 0.0
+    for k in range(shapes.shape[0]):
+        beside = distance * np.sin(max(inset, 0.0))
+        radius, slope = shapes[k, 0], shapes[k, 1]
+        total += np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
+    return total / shapes.shape[0]
 
 
 @compiled
@@ -315,7 +359,8 @@ def ranges_under_errors(
 ) -> tuple[Array, Array]:
     """Least and greatest distance (m, 2) [m] of both points from the present lens.
 
-    A row for each pair of displacements. Empty where an admitted error turns a bearing into the direction of travel.
+    A row for each pair of displacements. Empty where an admitted error turns a bearing into the direction of
+    travel.
     """
     t = vector(travel)
     lengths_0, angle_0 = ring_lengths(t, row(present, 0), row(first, 0), angular_error, shifts, signs)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
+from knee_gap_uncertainty.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import ScopeCalibration
@@ -151,6 +152,18 @@ def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
         target.x, target.y, target.z = (float(value) for value in values)
     for name, share in zip(SHARES, estimate.shares, strict=True):
         setattr(message, name, float(share))
+    return message
+
+
+def fill_gap_profile(message: Any, profile: GapProfile) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/GapProfile; returns the message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(profile.stamp_ns, 1_000_000_000)
+    message.header.frame_id = profile.frame_id
+    message.track_id = profile.track_id
+    for name in ("position", "gap", "gap_min", "gap_max"):
+        setattr(message, name, np.array(getattr(profile, name), dtype=np.float64))
+    message.widest = profile.widest
+    message.chosen_is_widest = profile.chosen_is_widest
     return message
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import norm
 
 from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS
@@ -20,8 +21,17 @@ from knee_gap_uncertainty.errors import (
 )
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.gap_profile import GapProfile, gap_profile
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
-from knee_gap_uncertainty.instrument_gap import Edges, flaw_of, instrument_gap, opening_of, worst_case
+from knee_gap_uncertainty.instrument_gap import (
+    Edges,
+    Opening,
+    admitted_ranges,
+    bounds_of_gap,
+    flaw_of,
+    instrument_gap,
+    opening_of,
+)
 from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
@@ -34,6 +44,8 @@ from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
 from knee_gap_uncertainty.views import Views
+
+Floats = npt.NDArray[np.float64]
 
 # Why views give no number, without the values: a reason that is counted must stay the same.
 REASONS: dict[type[MeasurementError], str] = {
@@ -88,6 +100,8 @@ class Track:
         # The last image that was found still, where the window does not keep it.
         self._passing: Views | None = None
         self.situation: Situation | None = None
+        # Of the present image, where it shows more sections and the gap is valid.
+        self.profile: GapProfile | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
         """Whether the edges are of the same two points and the pose of the same reference frame."""
@@ -96,6 +110,7 @@ class Track:
 
     def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
+        self.profile = None
         blank = GapEstimate(
             stamp_ns=edges.stamp_ns,
             frame_id=self.frame_id,
@@ -128,11 +143,12 @@ class Track:
         try:
             interval = confidence_interval(fitted, self._parameters.confidence_level)
             all_views = AllViews(views, fitted, interval)
-            self.situation = self._situation(edges, view, all_views)
+            section = self._section.at(edges, view, _nearest(fitted.points, view.lens))
+            self.situation = self._situation(edges, view, all_views, section)
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
             return self._told(blank, view, REASONS.get(type(error), str(error)))
-        return self._measured(blank, edges, view, bounds, parallax, all_views)
+        return self._measured(blank, edges, view, bounds, parallax, all_views, section)
 
     def _views_with(self, present: Views) -> Views:
         """The views kept and then the present one, which is not kept before it has been found to fit them."""
@@ -176,11 +192,13 @@ class Track:
         if length > DIRECTION_TRAVEL:
             self._direction = travel / length
 
-    def _situation(self, edges: EdgeObservation, present: PosedView, all_views: AllViews) -> Situation | None:
-        """What advice on motion can be based on; None while the points are not known at all."""
+    def _situation(
+        self, edges: EdgeObservation, present: PosedView, all_views: AllViews, section: Edges | str
+    ) -> Situation | None:
+        """What advice on motion can be based on; None while the points or the edges are not known at all."""
         assert self._first is not None
         assert all_views.views.lens_rotations is not None
-        if not np.isfinite(all_views.fit.points).all():
+        if isinstance(section, str) or not np.isfinite(all_views.fit.points).all():
             return None
         angular_error, translation_error = self._error_bounds(self._first, present)
         return Situation(
@@ -200,6 +218,7 @@ class Track:
             views=all_views.views,
             depth_drift=self._parameters.depth_drift,
             lasting_share=self._parameters.lasting_share,
+            edges=section,
         )
 
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
@@ -235,6 +254,7 @@ class Track:
         bounds: GapRange,
         parallax: float,
         all_views: AllViews,
+        edges: Edges | str,
     ) -> GapEstimate:
         """The estimate from the points' bounds and fit, and from the edges beside them in this image."""
         _, fitted, interval = all_views
@@ -247,14 +267,13 @@ class Track:
             parallax=parallax,
             view_count=fitted.view_count,
         )
-        distances = np.linalg.norm(fitted.points - view.lens, axis=1)
-        edges = self._section.at(observation, view, float(np.nanmin(distances, initial=np.inf)))
         if isinstance(edges, str):
             return replace(points, status=GapStatus.NO_EDGES, reason=edges)
         opening = opening_of(view.bearings, edges.bearings)
         if flaw := flaw_of(opening):
             return replace(points, status=GapStatus.NO_EDGES, reason=flaw)
-        gap_min, gap_max = self._worst_case(view, edges)
+        near, far, angular_error = self._admitted_ranges(view, opening)
+        gap_min, gap_max = bounds_of_gap(near, far, opening, edges, angular_error)
         estimate = replace(points, gap_min=gap_min, gap_max=gap_max, snr=0.0)
         if not edges.bounded:
             return replace(estimate, status=GapStatus.NO_EDGES, gap_max=np.inf, reason=AT_BORDER)
@@ -271,6 +290,9 @@ class Track:
             return replace(self._told(blank, view, TOO_LARGE), status=GapStatus.UNKNOWN)
         if not (bounds.gap_min <= fitted.gap <= bounds.gap_max and gap_min <= found.gap <= gap_max):
             return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
+        if observation.sections:
+            distances = np.linalg.norm(fitted.points - view.lens, axis=1)
+            self.profile = self._profile(observation, view, distances, (near, far), opening, edges)
         return replace(
             estimate,
             status=GapStatus.VALID,
@@ -285,19 +307,41 @@ class Track:
             shares=np.append(fitted.shares * (1.0 - found.shares.sum()), found.shares),
         )
 
-    def _worst_case(self, present: PosedView, edges: Edges) -> tuple[float, float]:
-        """Bounds [m] of the instrument gap from the first view and the present one with its edges."""
+    def _admitted_ranges(self, present: PosedView, opening: Opening) -> tuple[Floats, Floats, float]:
+        """Distances (m, 2) [m] of the points that the admitted errors allow, and the bound psi [rad]."""
         assert self._first is not None
         angular_error, translation_error = self._error_bounds(self._first, present)
-        return worst_case(
+        near, far = admitted_ranges(
             self._first.lens - present.lens,
             present.bearings,
             self._first.bearings,
-            opening_of(present.bearings, edges.bearings),
-            edges,
+            opening,
             angular_error,
             displacements(translation_error, 1),
             SIGNS[INTERVAL_SIGNS[self._parameters.interval]],
+        )
+        return near, far, angular_error
+
+    def _profile(
+        self,
+        observation: EdgeObservation,
+        view: PosedView,
+        distances: Floats,
+        near_far: tuple[Floats, Floats],
+        opening: Opening,
+        edges: Edges,
+    ) -> GapProfile:
+        assert view.view.lens_rotations is not None
+        return gap_profile(
+            observation.stamp_ns,
+            self.frame_id,
+            self.track_id,
+            observation.sections,
+            view.view.lens_rotations[0],
+            distances * opening.in_plane,
+            near_far,
+            opening,
+            edges,
         )
 
     def _told(self, blank: GapEstimate, view: PosedView, reason: str) -> GapEstimate:
@@ -305,6 +349,11 @@ class Track:
         assert self._first is not None
         baseline = float(np.linalg.norm(view.lens - self._first.lens))
         return replace(blank, baseline=baseline, view_count=len(self._window), reason=reason)
+
+
+def _nearest(points: Floats, lens: Floats) -> float:
+    """Distance [m] of the nearer point (2, 3) from a lens (3,); infinite where neither is known."""
+    return float(np.nanmin(np.linalg.norm(points - lens, axis=1), initial=np.inf))
 
 
 def _unbounded(estimate: GapEstimate, reason: str) -> GapEstimate:

@@ -8,7 +8,7 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration, ScopeTurn
+from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.advice_task import AdvicePace
@@ -42,6 +42,7 @@ class UncertaintyNode(BaseNode):
             for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr"))
         }
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
+        self._profile = self.create_publisher(GapProfile, "gap_profile", RESULT_QOS)
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         # What waits is taken in this order: the turn that is told with a pose before the pose.
         self.create_subscription(ScopeTurn, "scope_turn", self.on_turn, RESULT_QOS)
@@ -112,6 +113,8 @@ class UncertaintyNode(BaseNode):
                     publisher.publish(Float64(data=float(getattr(estimate, name))))
             elif estimate.reason:
                 self.log_once(estimate.reason, f"{estimate.status.name}: {estimate.reason}")
+        while self._estimator.profiles:
+            self._profile.publish(messages.fill_gap_profile(GapProfile(), self._estimator.profiles.popleft()))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""
