@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from knee_gap_uncertainty.acceptance import Rejection
 
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
@@ -75,7 +79,8 @@ class GapEstimate:
     """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
 
     `points` (2, 3) are in the frame `frame_id`. `shares` (4,) divide the variance among image, lens position,
-    lens rotation and common part. `reason` says why the status is not VALID; it is not in the message.
+    lens rotation and common part. `rejection` says why the status is not VALID, None where it is; it is not in
+    the message.
     """
 
     stamp_ns: int
@@ -96,4 +101,9 @@ class GapEstimate:
     translation_to_target: float = NAN
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
     shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(4, NAN))
-    reason: str = ""
+    rejection: "Rejection | None" = None
+
+    @property
+    def reason(self) -> str:
+        """Why the status is not VALID, in words; empty where it is."""
+        return str(self.rejection) if self.rejection is not None else ""

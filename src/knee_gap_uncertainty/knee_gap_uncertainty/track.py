@@ -6,16 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_uncertainty.acceptance import Facts, Kept, judge
 from knee_gap_uncertainty.calibration_fit import explained_by
 from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.depth_drift import with_depth_drift
-from knee_gap_uncertainty.errors import (
-    MeasurementError,
-    ParallelToTravelError,
-    RaysMeetBehindError,
-    TravelTooShortError,
-    UnboundedError,
-)
+from knee_gap_uncertainty.errors import MeasurementError, TravelTooShortError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
@@ -30,25 +25,10 @@ from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
 from knee_gap_uncertainty.views import Views
 
-# Why views give no number, without the values: a reason that is counted must stay the same.
-REASONS: dict[type[MeasurementError], str] = {
-    TravelTooShortError: "the scope has hardly moved",
-    ParallelToTravelError: "a point lies along the scope's travel",
-    RaysMeetBehindError: "the rays to a point do not meet in front of the scope",
-    UnboundedError: "the rays to a point are parallel",
-}
-UNBOUNDED = "the admitted errors leave the gap unbounded"
-UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
-CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
-TOO_LARGE = "the gap is larger than any joint's"
-UNCHECKED = "two views cannot check each other"
-# Along the line of the ray from the other view, one of two views may be wrong by any amount.
-FEWEST_VIEWS_TO_CHECK = 3
-
-
 # The direction of travel is that over this time [ns], if the lens went farther in it than this [m].
 DIRECTION_TIME_NS = 250_000_000
 DIRECTION_TRAVEL = 0.2e-3
+FEWEST_VIEWS = 2  # that show a depth
 
 
 class AllViews(NamedTuple):
@@ -67,13 +47,18 @@ class Track:
         track_id: int,
         frame_id: str,
         parameters: EstimatorParameters,
-        calibration: CalibrationError | None = None,
+        calibration: CalibrationError,
+        camera_columns: int = 0,
     ) -> None:
         self._calibration = calibration
+        self._camera_columns = camera_columns
+        # Edges that state no error of their camera have that of one which nobody calibrated.
+        self._camera_error = calibration.camera if camera_columns else parameters.camera_error
         self.track_id = track_id
         self.frame_id = frame_id
         self._parameters = parameters
         self._first: PosedView | None = None
+        self._segment = 0
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
         self._direction = np.full(3, np.nan)
@@ -84,9 +69,15 @@ class Track:
         self.situation: Situation | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
-        """Whether the edges are of the same two points and the pose of the same reference frame."""
+        """Whether the edges are of the same points and camera, and the pose continues the earlier ones."""
         same = edges.track_id == self.track_id and pose.frame_id == self.frame_id
-        return same and not self.ended
+        # Errors of a camera are comparable with those of the same camera only.
+        same_camera = edges.camera_errors.shape[-1] == self._camera_columns
+        return same and same_camera and not self.breaks_at(pose) and not self.ended
+
+    def breaks_at(self, pose: LensPose) -> bool:
+        """Whether the lens made a step, or was lost, between the track's views and this pose."""
+        return self._first is not None and pose.segment != self._segment
 
     def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
@@ -99,33 +90,37 @@ class Track:
             confidence_level=self._parameters.confidence_level,
         )
         try:
-            view = posed_view(edges, pose, self._parameters.tracker_bound)
+            view = posed_view(edges, pose, self._parameters.tracker_bound, self._camera_error)
         except MeasurementError as error:
-            return replace(blank, status=GapStatus.NO_EDGES, reason=str(error))
+            return self._refused(blank, Facts(self._parameters, edges_flaw=str(error)))
         if self._first is None:
-            self._first = view
+            self._first, self._segment = view, pose.segment
         self._follow_direction(view)
+        blank = replace(
+            blank,
+            baseline=float(np.linalg.norm(view.lens - self._first.lens)),
+            view_count=len(self._window),
+        )
         views = self._views_with(view.view)
-        fitted, flaw = self._fitted(views)
+        fitted, no_fit = self._fitted(views)
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
-            return self._contradicted(blank, view, finding)
+            return self._contradicted(blank, finding)
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
-            return self._told(blank, view, flaw)
+            return self._refused(blank, Facts(self._parameters, error=no_fit))
         parameters = self._parameters
         fitted = with_depth_drift(
             fitted, views, self._first.lens, parameters.depth_drift, parameters.lasting_share
         )
-        if self._calibration is not None:
-            fitted = self._calibration.widened(fitted, views)
+        fitted = self._calibration.widened(fitted, views)
         try:
             interval = confidence_interval(fitted, self._parameters.confidence_level)
             all_views = AllViews(views, fitted, interval)
             self.situation = self._situation(edges, view, all_views)
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
-            return self._told(blank, view, REASONS.get(type(error), str(error)))
+            return self._refused(blank, Facts(self._parameters, error=error))
         return self._measured(blank, view, bounds, parallax, all_views)
 
     def _views_with(self, present: Views) -> Views:
@@ -139,26 +134,33 @@ class Track:
         self, views: Views, fitted: MultiViewFit | None
     ) -> tuple[Views, MultiViewFit | None, Views | None]:
         """The views, their fit and the passing view, less what the calibration's error explains of them."""
-        shared = explained_by(self._calibration, views) if self._calibration is not None else None
+        shared = explained_by(self._calibration, views)
         if shared is None:
             return views, fitted, self._passing
         passing = None if self._passing is None else shared.taken_from(self._passing)
         corrected = shared.taken_from(views)
         return corrected, self._fitted(corrected)[0], passing
 
-    def _fitted(self, views: Views) -> tuple[MultiViewFit | None, str]:
+    def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
+        if len(views) < FEWEST_VIEWS:
+            return None, TravelTooShortError("a single view shows no depth")
         try:
-            return fit(views), ""
+            return fit(views), None
         except MeasurementError as error:
-            return None, REASONS.get(type(error), str(error))
+            return None, error
 
-    def _contradicted(self, blank: GapEstimate, view: PosedView, finding: Finding) -> GapEstimate:
+    def _contradicted(self, blank: GapEstimate, finding: Finding) -> GapEstimate:
         """No number from an image whose points are not where the track has them; the track may end here."""
         self.ended = finding is Finding.MOVED
         self.situation = None
-        status = GapStatus.JOINT_MOVED if self.ended else GapStatus.UNKNOWN
-        return replace(self._told(blank, view, finding.value), status=status)
+        return self._refused(blank, Facts(self._parameters, finding=finding))
+
+    def _refused(self, blank: GapEstimate, facts: Facts) -> GapEstimate:
+        """What is known of every view, without a number, as the rule that the facts break has it."""
+        verdict = judge(facts)
+        assert verdict is not None
+        return replace(blank, status=verdict.status, rejection=verdict.rejection)
 
     def _follow_direction(self, present: PosedView) -> None:
         """Note where the lens is going; it keeps its direction while it stands still."""
@@ -216,8 +218,6 @@ class Track:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
         angle = max(first.angular_error, present.angular_error)
         position = max(first.translation_error, present.translation_error)
-        if self._calibration is None:
-            return angle, position
         shared = self._calibration.bounds(first, present, self._parameters.tracker_bound)
         return angle + shared[0], position + shared[1]
 
@@ -225,38 +225,41 @@ class Track:
         self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews
     ) -> GapEstimate:
         _, fitted, interval = all_views
-        estimate = replace(
-            self._told(blank, view, ""),
+        width = bounds.gap_max - bounds.gap_min
+        measured = replace(
+            blank,
+            status=GapStatus.VALID,
+            gap=fitted.gap,
             gap_min=bounds.gap_min,
             gap_max=bounds.gap_max,
-            snr=0.0,
+            snr=fitted.gap / width if width > 0.0 else np.inf,
             confidence_min=interval.lower,
             confidence_max=interval.upper,
             parallax=parallax,
             view_count=fitted.view_count,
+            points=fitted.points,
             shares=fitted.shares,
         )
-        if self._joint_motion.still_count < FEWEST_VIEWS_TO_CHECK:
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
-        if not np.isfinite(bounds.gap_max):
-            return replace(estimate, reason=UNBOUNDED)
-        if interval.refused or not np.isfinite(fitted.gap):
-            # The lower bounds stand; an upper one must not be taken for an answer.
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCERTAIN_DEPTH)
-        if fitted.gap > self._parameters.largest_gap:
-            return replace(self._told(blank, view, TOO_LARGE), status=GapStatus.UNKNOWN)
-        if not bounds.gap_min <= fitted.gap <= bounds.gap_max:
-            return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
-        return replace(
-            estimate,
-            status=GapStatus.VALID,
-            gap=fitted.gap,
-            snr=fitted.gap / (bounds.gap_max - bounds.gap_min),
-            points=fitted.points,
+        facts = Facts(
+            self._parameters,
+            measured=measured,
+            depth_refused=bool(interval.refused),
+            still_count=self._joint_motion.still_count,
+            distance=float(np.linalg.norm(fitted.points - view.lens, axis=1).max()),
         )
-
-    def _told(self, blank: GapEstimate, view: PosedView, reason: str) -> GapEstimate:
-        """What is known of every view: how far the lens has come, and the reason why there is no more."""
-        assert self._first is not None
-        baseline = float(np.linalg.norm(view.lens - self._first.lens))
-        return replace(blank, baseline=baseline, view_count=len(self._window), reason=reason)
+        verdict = judge(facts)
+        if verdict is None:
+            return measured
+        if verdict.kept is Kept.NOTHING:
+            return self._refused(blank, facts)
+        # The lower bounds stand; an upper one must not be taken for an answer.
+        return replace(
+            measured,
+            status=verdict.status,
+            rejection=verdict.rejection,
+            gap=np.nan,
+            gap_max=np.inf,
+            snr=0.0,
+            confidence_max=np.inf,
+            points=blank.points,
+        )
