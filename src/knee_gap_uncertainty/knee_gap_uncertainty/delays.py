@@ -1,4 +1,4 @@
-"""Clocks and delays of a live node: how late a message is, and how time goes on when its clock stands still."""
+"""Clocks and delays of a live node: how late a message is, and how time goes on when its clock stops."""
 
 from collections import deque
 

@@ -79,8 +79,8 @@ class GapEstimate:
     """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
 
     `points` (2, 3) are in the frame `frame_id`. `shares` (4,) divide the variance among image, lens position,
-    lens rotation and common part. `rejection` says why the status is not VALID, None where it is; it is not in
-    the message.
+    lens rotation and common part. `rejection` is why the status is not VALID, None if it is; it is not in the
+    message.
     """
 
     stamp_ns: int

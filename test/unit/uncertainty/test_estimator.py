@@ -21,6 +21,8 @@ MS = 1_000_000
 FRAME_NS = 16_666_667
 POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
 TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
+# In steps that a hand can make between two images.
+TRAVEL = [float(x) for x in np.linspace(0.0, 0.006, 13)]
 TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
 
 
@@ -82,7 +84,7 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
 
 
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
-    estimate = run(GapEstimator(EXACT), [0.0, 0.003, 0.005])[-1]
+    estimate = run(GapEstimator(EXACT), list(np.linspace(0.0, 0.005, 11)))[-1]
     first, now = edges(0, 0.0), edges(0, 0.005)
     expected = gap_range(
         [0, 0, 0],
@@ -149,7 +151,7 @@ def test_unusable_edges_and_silence_are_no_edges() -> None:
 
 def test_another_track_starts_from_its_own_first_view() -> None:
     estimator = GapEstimator(EXACT)
-    assert run(estimator, [0.0, 0.003, 0.006])[-1].status is GapStatus.VALID
+    assert run(estimator, TRAVEL)[-1].status is GapStatus.VALID
     estimates = run(estimator, [0.006, 0.006], track_id=2, begin=2 * 10**9)
     assert {e.status for e in estimates} == {GapStatus.INSUFFICIENT_PARALLAX}
     assert {e.baseline for e in estimates} == {0.0}
@@ -157,8 +159,8 @@ def test_another_track_starts_from_its_own_first_view() -> None:
 
 def test_bag_that_starts_again_keeps_nothing_of_before() -> None:
     estimator = GapEstimator(EXACT)
-    before = run(estimator, [0.0, 0.003, 0.006])
-    again = run(estimator, [0.0, 0.003, 0.006])
+    before = run(estimator, TRAVEL)
+    again = run(estimator, TRAVEL)
     assert [e.status for e in again] == [e.status for e in before]
     assert [e.gap for e in again] == pytest.approx([e.gap for e in before], nan_ok=True)
     assert estimator.counts["stamps ran backwards"] == 1
@@ -166,8 +168,8 @@ def test_bag_that_starts_again_keeps_nothing_of_before() -> None:
 
 def test_other_reference_frame_ends_the_track() -> None:
     estimator = GapEstimator(EXACT)
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     estimator.add_pose(pose(stamp - MS, 0.006, "tibia"), stamp)
     estimator.add_edges(edges(stamp, 0.006), stamp)
     (estimate,) = estimator.add_pose(pose(stamp + MS, 0.006, "tibia"), stamp)
@@ -178,8 +180,8 @@ def test_other_reference_frame_ends_the_track() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 2.0, 0.0])
 def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
     estimator = GapEstimator(EXACT)
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     broken = edges(stamp, 0.006)
     broken = replace(broken, bearings=broken.bearings * bad)
     estimator.add_pose(pose(stamp - MS, 0.006), stamp)
@@ -205,8 +207,8 @@ def test_pose_that_is_repeated_under_new_stamps_is_lost_tracking() -> None:
 def test_bound_below_its_own_standard_deviation_is_refused() -> None:
     """The worst case of an error whose bound contradicts its covariance would be none."""
     estimator = GapEstimator(EXACT)
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     edge = replace(edges(stamp, 0.006), angular_error=np.radians(0.05))
     (estimate,) = estimator.add_edges(edge, stamp)
     assert estimate.status is GapStatus.NO_EDGES
