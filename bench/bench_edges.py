@@ -30,7 +30,10 @@ from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapStatus
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -97,7 +100,7 @@ class GapCheck:
     """The estimator behind the edges, and the true distance of the points of every track."""
 
     def __init__(self) -> None:
-        self._estimator = GapEstimator()
+        self._estimator = GapEstimator(EXACT)
         self._truth: dict[int, float] = {}
 
     def begin(self, track_id: int, points: Array) -> None:

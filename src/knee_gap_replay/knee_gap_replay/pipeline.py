@@ -38,7 +38,8 @@ from knee_gap_replay.qos import QosName
 from knee_gap_replay.topics import InputTopics
 from knee_gap_replay.types import blank
 from knee_gap_uncertainty import messages
-from knee_gap_uncertainty.estimator import NANOSECONDS, GapEstimator
+from knee_gap_uncertainty.delays import NANOSECONDS
+from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.motion_advice import AdviceParameters

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from knee_gap_uncertainty.acceptance import Rejection
 
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
@@ -101,8 +105,8 @@ class GapEstimate:
     """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
 
     `points` (2, 3), `instrument_point` (3,) and `instrument_axis` (3,) are in the frame `frame_id`. `shares`
-    (6,) divide the variance among image, lens position, lens rotation, common part, edges and shape. `reason`
-    is why the status is not VALID.
+    (6,) divide the variance among image, lens position, lens rotation, common part, edges and shape.
+    `rejection` is why the status is not VALID, None if it is.
     """
 
     stamp_ns: int
@@ -130,4 +134,9 @@ class GapEstimate:
     translation_to_target: float = NAN
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
     shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(6, NAN))
-    reason: str = ""
+    rejection: "Rejection | None" = None
+
+    @property
+    def reason(self) -> str:
+        """Why the status is not VALID, in words; empty where it is."""
+        return str(self.rejection) if self.rejection is not None else ""

@@ -227,19 +227,21 @@ def worst_case(
     opening: Opening,
     edges: Edges,
     angular_error: float,
+    image_error: float,
     shifts: Array,
     signs: Array,
 ) -> tuple[float, float]:
     """Least and greatest instrument gap [m] that bounded errors of points, edges and shape allow.
 
     `travel` (3,) [m] leads from the present lens to the first; `present` and `first` (2, 3) are the bearings
-    of the points from there. `angular_error` [rad] bounds each bearing's error, `shifts` (m, 3) [m] are the
+    of the points from there. `angular_error` [rad] bounds each bearing's error, and `image_error` the part of
+    it that the image alone is to blame for, between a point and its edge; `shifts` (m, 3) [m] are the
     displacements of either lens, and `signs` the rows of (17) and (18) that are admitted, as for the error
     clouds. Both points are seen from the same two lenses, so they share the displacements. The greatest gap
     is infinite where a point may lie at infinity; the least is 0 where nothing bounds it from below.
     """
     near, far = admitted_ranges(travel, present, first, opening, angular_error, shifts, signs)
-    return bounds_of_gap(near, far, opening, edges, angular_error)
+    return bounds_of_gap(near, far, opening, edges, image_error)
 
 
 def admitted_ranges(
@@ -259,12 +261,12 @@ def admitted_ranges(
 
 
 def bounds_of_gap(
-    near: Array, far: Array, opening: Opening, edges: Edges, angular_error: float
+    near: Array, far: Array, opening: Opening, edges: Edges, image_error: float
 ) -> tuple[float, float]:
     """Least and greatest instrument gap [m] for the distances of `admitted_ranges`; as `worst_case`."""
     if not near.size:
         return 0.0, np.inf
-    narrower = edges.error - angular_error
+    narrower = edges.error - image_error
     lower = least_gap(
         near,
         far,

@@ -82,8 +82,8 @@ class Situation(NamedTuple):
     """What is known at an image; all in the frame of the poses, `frame_id` is that of the lens.
 
     `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
-    coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad] and `translation_error`
-    [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
+    coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad], `image_error` [rad],
+    the part of it that is the image's alone, and `translation_error` [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
     vector of the present travel. `depth_drift` and `lasting_share` are the estimator's. `edges` are those of
     the opening that the present lens sees.
     """
@@ -97,6 +97,7 @@ class Situation(NamedTuple):
     points: Floats
     direction: Floats
     angular_error: float
+    image_error: float
     translation_error: float
     interval: Literal["worst_case", "paper"]
     apex: Literal["first", "second", "best"]
@@ -150,6 +151,7 @@ def snr_after(situation: Situation, offset: Floats) -> float:
         opening,
         edges,
         situation.angular_error,
+        situation.image_error,
         displacements(situation.translation_error, 1),
         SIGNS[INTERVAL_SIGNS[situation.interval]],
     )

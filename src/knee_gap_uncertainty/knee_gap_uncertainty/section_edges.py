@@ -11,7 +11,6 @@ Array = npt.NDArray[np.float64]
 
 NOT_YET = "no image of the track has shown the edges of the opening"
 UNSEEN = "the edges of the opening were not seen for too long"
-AT_BORDER = "an edge of the opening lies beyond the border of the picture"
 NOT_FINITE = "the edges are marked as seen and carry numbers that cannot be used"
 
 # An edge of smooth bone lies up to half as far again from the lens as the point beside it: while the lens
