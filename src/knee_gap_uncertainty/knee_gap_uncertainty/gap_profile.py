@@ -72,7 +72,7 @@ def gap_profile(
     (m, 2) [m] those that the admitted errors allow, as of `ranges_under_errors`; `opening` and `edges` belong
     to the chosen section.
     """
-    along = np.cross(opening.view, opening.across)
+    along = np.cross(opening.across, opening.view)
     depth = float(ranges.mean())
     rows = []
     for section in sections:

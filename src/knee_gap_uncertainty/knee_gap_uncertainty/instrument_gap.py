@@ -39,7 +39,8 @@ CONTOUR_SHAPES = np.array([[radius, 1.0] for radius in (0.008, 0.012, 0.016, 0.0
 RIM_SHAPES = np.array([[0.0, np.tan(np.radians(slope))] for slope in (25.0, 35.0, 45.0, 60.0, 80.0)])
 ALL_SHAPES = np.concatenate([CONTOUR_SHAPES, RIM_SHAPES])
 # By the kind of edge in knee_gap_msgs/GapEdges.
-SHAPES = {1: RIM_SHAPES, 2: CONTOUR_SHAPES}
+KIND_RIM, KIND_CONTOUR = 1, 2
+SHAPES = {KIND_RIM: RIM_SHAPES, KIND_CONTOUR: CONTOUR_SHAPES}
 
 # How far [m] a real surface departs from these shapes: ripples, frayed rims, a point beside the section.
 ROUGHNESS = 0.05e-3
