@@ -73,6 +73,13 @@ class GapEdgeDetector:
         """Confidence [0, 1] of the last search that its dark part is a gap; NaN where it found none."""
         return self._search.confidence
 
+    @property
+    def section_distance(self) -> float:
+        """Distance [m] of the tissue beside the section, by the lens poses; NaN where it is not known."""
+        if self._track is None:
+            return float("nan")
+        return float(np.mean([point.distance for point in self._track.points]))
+
     def end_track(self) -> None:
         """Forget the points; the next image starts a new track."""
         self._track = None

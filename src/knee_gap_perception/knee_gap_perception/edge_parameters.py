@@ -108,6 +108,13 @@ class EdgeParameters:
             "range": (0.0, 60.0),
         },
     )
+    instrument_diameter: float = field(
+        default=0.0,
+        metadata={
+            "description": "Diameter of the instrument that the overlay draws in the opening; 0: none [m]",
+            "range": (0.0, 0.02),
+        },
+    )
     frozen_images: int = field(
         default=3,
         metadata={

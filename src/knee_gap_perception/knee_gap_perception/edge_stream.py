@@ -231,7 +231,9 @@ class EdgeStream:
         mask = self.mask()
         if self._image is None or self.latest is None or mask is None:
             return None
-        return draw_overlay(self._image, self.latest, mask, self.reason, self._camera)
+        diameter = self.detector.parameters.instrument_diameter
+        instrument = diameter / self.detector.section_distance if diameter > 0.0 else float("nan")
+        return draw_overlay(self._image, self.latest, mask, self.reason, self._camera, instrument)
 
 
 def _read(message: Any) -> Image:

@@ -11,6 +11,7 @@ Image = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
 
 POINT_COLOURS = ((80, 200, 255), (255, 170, 60))  # blue, green, red of G0 and G1
+SECTION_COLOUR = (240, 240, 240)
 OUTLINE_COLOUR = (90, 220, 90)
 WORD_COLOURS = {EdgeStatus.VALID: (90, 220, 90), EdgeStatus.UNKNOWN: (160, 160, 160)}
 REFUSED_COLOUR = (60, 90, 255)
@@ -19,11 +20,18 @@ ELLIPSE_ZOOM = 5.0
 
 
 def draw_overlay(
-    image: Image, edges: GapEdges, mask: Image, reason: str, camera: Camera | None = None
+    image: Image,
+    edges: GapEdges,
+    mask: Image,
+    reason: str,
+    camera: Camera | None = None,
+    instrument: float = float("nan"),
 ) -> Image:
     """A copy of an image (h, w, 3) with the outline of the gap, points, kinds, errors and status on it.
 
-    `mask` (h, w) is 255 in the gap, or empty. The ellipses are drawn five times as large as three standard
+    `mask` (h, w) is 255 in the gap, or empty. The circle between the edges is the thickest that touches no
+    tissue; a second one, green if it fits and red if not, has the angle `instrument` [rad] that an instrument
+    spans at the section, NaN for none. The ellipses are drawn five times as large as three standard
     deviations; the words tell the bound in degrees. Nothing is drawn of points that are not known.
     """
     drawn = image.copy()
@@ -37,6 +45,8 @@ def draw_overlay(
         cv2.line(drawn, ends[0], ends[1], (255, 255, 255), round(unit), cv2.LINE_AA)
         for index in (0, 1):
             _draw_point(drawn, edges, index, camera, unit)
+    if edges.section.seen:
+        _draw_section(drawn, edges, camera, instrument, unit)
     _write(
         drawn, words(edges, reason), (round(14 * unit), round(28 * unit)), _word_colour(edges.status), unit
     )
@@ -53,6 +63,23 @@ def words(edges: GapEdges, reason: str) -> str:
 
 def _word_colour(status: EdgeStatus) -> tuple[int, int, int]:
     return WORD_COLOURS.get(status, REFUSED_COLOUR)
+
+
+def _draw_section(
+    drawn: Image, edges: GapEdges, camera: Camera | None, instrument: float, unit: float
+) -> None:
+    """The thickest circle between the edges, and the instrument beside it."""
+    first, second = edges.section.pixels
+    middle = (first + second) / 2
+    centre = (round(float(middle[0])), round(float(middle[1])))
+    radius = float(np.linalg.norm(second - first)) / 2
+    cv2.circle(drawn, centre, round(radius), SECTION_COLOUR, round(unit), cv2.LINE_AA)
+    if camera is None or not np.isfinite(instrument):
+        return
+    half = instrument / camera.radians_per_pixel(middle) / 2
+    if np.isfinite(half) and half < 4.0 * max(drawn.shape[:2]):
+        colour = OUTLINE_COLOUR if half <= radius else REFUSED_COLOUR
+        cv2.circle(drawn, centre, round(half), colour, round(2 * unit), cv2.LINE_AA)
 
 
 def _draw_point(drawn: Image, edges: GapEdges, index: int, camera: Camera | None, unit: float) -> None:

@@ -115,6 +115,11 @@ class PointTrack:
         return Sighting(self._anchors[0].pixel, REGISTRATION_FLOOR**2 * np.eye(2), True, 1.0)
 
     @property
+    def distance(self) -> float:
+        """Distance [m] of the point from the lens of the first image, by the lens poses; NaN without any."""
+        return float("nan") if self._plane is None else 1.0 / float(np.linalg.norm(self._plane.mean))
+
+    @property
     def unseen(self) -> int:
         """Images since the point was last seen."""
         return self._unseen

@@ -38,6 +38,7 @@ WIDTH_SHARE = 0.3  # of the width of a border, that its place is uncertain by
 BOUND = 3.0  # standard deviations
 MARGIN = 3.0  # [px] from the border of the field of view within which an edge counts as lying at it
 FOREIGN_SHARE = 0.3  # of the lines of an instrument's width that may be covered
+COARSE = 40  # steps in which the centre of the largest circle is looked for, three times finer and finer
 STATIONS = 3  # sections to either side in a profile
 STATION_STEP = 0.6  # of the circle's radius between two of them
 
@@ -72,21 +73,22 @@ def largest_circle(rows: Array, borders: tuple[Array, Array], at: float = 0.0) -
     Borders are distances from the line through the section's centre, to the one side and to the other, both
     positive outwards; all lengths in pixels.
     """
-    sideways = (rows - at) ** 2
     reach = float(min(borders[0].max(), borders[1].max()))
-    offsets = np.linspace(-reach, reach, 161)
-    distances = np.stack(
-        [
-            np.where(border + sign * offsets[:, None] > 0.0, border + sign * offsets[:, None], 0.0) ** 2
-            + sideways
-            for sign, border in ((1.0, borders[0]), (-1.0, borders[1]))
-        ]
-    )
-    nearest = np.sqrt(distances.min(axis=2))
-    room = nearest.min(axis=0)
-    best = int(room.argmax())
-    contacts = distances[:, best].argmin(axis=1)
-    return Circle(float(offsets[best]), float(room[best]), (int(contacts[0]), int(contacts[1])))
+    offset = 0.0
+    for half in (reach, 2.0 * reach / COARSE, 4.0 * reach / COARSE**2):
+        offsets = offset + np.linspace(-half, half, COARSE + 1)
+        squares = _squared_distances(rows, borders, at, offsets)
+        room = squares.min(axis=(0, 2))
+        best = int(room.argmax())
+        offset = float(offsets[best])
+    contacts = squares[:, best].argmin(axis=1)
+    return Circle(offset, float(np.sqrt(room[best])), (int(contacts[0]), int(contacts[1])))
+
+
+def _squared_distances(rows: Array, borders: tuple[Array, Array], at: float, offsets: Array) -> Array:
+    """Squared distances (2, m, n) [px^2] of both borders from places (m,) on the line at `at`."""
+    first, second = borders[0] + offsets[:, None], borders[1] - offsets[:, None]
+    return np.asarray(np.maximum(np.stack([first, second]), 0.0) ** 2 + (rows - at) ** 2)
 
 
 @dataclass(frozen=True)

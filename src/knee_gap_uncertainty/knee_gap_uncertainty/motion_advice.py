@@ -83,7 +83,8 @@ class Situation(NamedTuple):
 
     `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
     coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad], `image_error` [rad],
-    the part of it that is the image's alone, and `translation_error` [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
+    the part of it that is the image's alone, and `translation_error` [m] bound the errors; `views` are those
+    of the track, the present one last; `direction` (3,) is the unit
     vector of the present travel. `depth_drift` and `lasting_share` are the estimator's. `edges` are those of
     the opening that the present lens sees.
     """
