@@ -10,6 +10,7 @@ from std_msgs.msg import Float64
 
 from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_node.seam import Fault
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.advice_task import AdvicePace
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -112,6 +113,10 @@ class UncertaintyNode(BaseNode):
                     publisher.publish(Float64(data=float(getattr(estimate, name))))
             elif estimate.reason:
                 self.log_once(estimate.reason, f"{estimate.status.name}: {estimate.reason}")
+
+    def recover(self, fault: Fault) -> None:
+        """Start the estimator afresh, and say of the image that raised that nothing is known of it."""
+        self.publish(self._estimator.recover(fault.reason))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""
