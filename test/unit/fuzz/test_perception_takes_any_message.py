@@ -197,3 +197,14 @@ def test_images_between_poses_of_any_kind(
             assert np.isfinite(edges.bearings).all()
             assert 0.0 < edges.angular_error < 1.0
     assert stream.overlay() is not None or excess
+
+
+@pytest.mark.parametrize("tiny", [5e-324, -1e-310, 1e-200])
+@pytest.mark.parametrize("model", ["equidistant", "plumb_bob"])
+def test_a_coefficient_that_is_nearly_none_changes_nothing(model: str, tiny: float) -> None:
+    cameras = []
+    for last in (0.0, tiny):
+        d = [0.01, 0.002, 0.0, last] if model == "equidistant" else [0.01, 0.002, 0.0, 0.0, last]
+        info = SimpleNamespace(width=640, height=360, distortion_model=model, d=d, k=K)
+        cameras.append(camera_from_info(info).bearings([[100.0, 50.0], [400.0, 300.0]]))
+    np.testing.assert_array_equal(*cameras)
