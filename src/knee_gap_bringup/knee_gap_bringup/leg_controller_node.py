@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
-from rclpy.time import Time
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
@@ -49,7 +48,9 @@ class LegControllerNode(BaseNode):
     def on_gap(self, message: GapEstimate) -> None:
         """Decide on one estimate."""
         valid = message.status == GapEstimate.STATUS_VALID
-        age = (self.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds / 1e9
+        # Not by rclpy's Time, which raises at a stamp before 1970.
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        age = (self.get_clock().now().nanoseconds - stamp_ns) / 1e9
         blind = message.status in BLIND
         estimate = Estimate(valid, message.track_id, age, message.gap_min, message.gap_max, blind)
         self.command(self._control.on_estimate(estimate, time.monotonic()))

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from knee_gap_node.errors import ConfigurationError
 from knee_gap_node.parameters import as_rows, declare, refuse_unknown
+from knee_gap_node.seam import Fault, Seam
 
 Parameters = TypeVar("Parameters")
 
@@ -35,7 +36,77 @@ LATCHED_QOS = QoSProfile(
 Health = tuple[bool, str, Mapping[str, object]]
 
 
-class BaseNode(Node):
+# The events of a subscription that a node may handle.
+EVENTS = ("deadline", "incompatible_qos", "liveliness", "message_lost", "incompatible_type", "matched")
+
+
+class GuardedNode(Node):
+    """A node that no message ends: whatever a callback raises is refused, counted and logged at its seam."""
+
+    def __init__(self, name: str) -> None:
+        # Before rclpy's own subscriptions and services, which are guarded as well.
+        self.seam = Seam(self._on_fault, passes=self._is_shutdown)
+        self._faults_logged: set[str] = set()
+        super().__init__(name)
+
+    def recover(self, fault: Fault) -> None:
+        """Start the core afresh after a fault, and answer what it refused; a node that has a core does so."""
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], *options: Any, **named: Any
+    ) -> Any:
+        """Subscribe as rclpy does, with all callbacks guarded."""
+        events = named.get("event_callbacks")
+        for event in EVENTS:
+            if (handler := getattr(events, event, None)) is not None:
+                setattr(events, event, self.guarded(f"{event} of {topic}", handler))
+        return super().create_subscription(
+            msg_type, topic, self.guarded(f"message on {topic}", callback), *options, **named
+        )
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], None], *options: Any, **named: Any
+    ) -> Any:
+        """Start a timer as rclpy does, with a guarded callback."""
+        what = f"call of {getattr(callback, '__name__', 'a timer')}"
+        return super().create_timer(timer_period_sec, self.guarded(what, callback), *options, **named)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], *options: Any, **named: Any
+    ) -> Any:
+        """Offer a service as rclpy does; a request that raises gets the empty answer, with the reason."""
+
+        def answer(fault: Fault, _: Any, response: Any) -> Any:
+            self._recover(fault)
+            for field in ("reason", "message"):
+                if hasattr(response, field):
+                    setattr(response, field, fault.reason)
+            return response
+
+        guarded = self.seam.guarded(f"request of {srv_name}", answer, callback)
+        return super().create_service(srv_type, srv_name, guarded, *options, **named)
+
+    def guarded(self, what: str, callback: Callable[..., None]) -> Callable[..., None]:
+        """A callback that raises nothing: what it would raise refuses `what`, and the core starts afresh."""
+        return self.seam.guarded(what, lambda fault, *_: self._recover(fault), callback)
+
+    def _recover(self, fault: Fault) -> None:
+        # What cannot even start afresh is counted too, and no reason to end either.
+        self.seam.call(f"recovery after {fault.what}", lambda _: None, lambda: self.recover(fault))
+
+    def _on_fault(self, fault: Fault) -> None:
+        """Log a fault the first time that it comes; later ones are counted only."""
+        if fault.reason not in self._faults_logged:
+            self._faults_logged.add(fault.reason)
+            self.get_logger().error(fault.line)
+            self.get_logger().debug(fault.traceback)
+
+    def _is_shutdown(self, error: Exception) -> bool:
+        """Whether an exception ends the node as it should: ROS is shut down, or a signal came meanwhile."""
+        return isinstance(error, ExternalShutdownException) or not self.context.ok()
+
+
+class BaseNode(GuardedNode):
     """A node whose parameters come from a dataclass and that says once a second how it fares."""
 
     def __init__(self, name: str, *, health: Callable[[], Health]) -> None:
@@ -44,6 +115,7 @@ class BaseNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RESULT_QOS)
         self._diagnostics_timer = self.create_timer(1.0, self.publish_diagnostics)
         self._reasons_logged: set[str] = set()
+        self._faults_before = 0
 
     def declare(self, kind: type[Parameters]) -> Parameters:
         """Declare the fields of the dataclass `kind` as read-only parameters; return their values."""
@@ -56,6 +128,10 @@ class BaseNode(Node):
     def publish_diagnostics(self) -> None:
         """Publish the node's health now."""
         well, words, counts = self._health()
+        if (faults := self.seam.counts.total()) > self._faults_before:
+            well, words = False, f"{faults - self._faults_before} messages refused by a fault; {words}"
+        self._faults_before = faults
+        counts = {**counts, **self.seam.counts}
         status = DiagnosticStatus(
             level=DiagnosticStatus.OK if well else DiagnosticStatus.WARN,
             name=self.get_fully_qualified_name(),

@@ -15,7 +15,11 @@ from knee_gap_perception.errors import PerceptionError
 
 Array = npt.NDArray[np.float64]
 
+# Coefficients, focal lengths and centres beyond this [-, px] are no camera's, and overflow when multiplied.
+LARGEST_NUMBER = 1e6
+SHORTEST_FOCAL = 1e-3  # [px]
 PIXEL_TOLERANCE = 1e-6  # [px] what a pixel may move when it is taken to a direction and back
+NO_TERM = 1e-30  # [-] of a polynomial's largest term, below which another is none
 TABLE_SIZE = 2048  # samples of a distortion curve, from which its inverse starts
 
 
@@ -72,6 +76,11 @@ def _check_matrix(fx: float, fy: float, cx: float, cy: float) -> None:
         raise PerceptionError(
             f"focal lengths must be above 0 px, not fx={fx}, fy={fy} px (0 stands for an uncalibrated camera)"
         )
+    if min(fx, fy) < SHORTEST_FOCAL or max(np.abs([fx, fy, cx, cy])) > LARGEST_NUMBER:
+        raise PerceptionError(
+            f"the camera matrix must hold focal lengths in [{SHORTEST_FOCAL:g}, {LARGEST_NUMBER:g}] px and a "
+            f"centre within {LARGEST_NUMBER:g} px, not fx={fx}, fy={fy}, cx={cx}, cy={cy} px"
+        )
 
 
 def _coefficients(distortion: Sequence[float], allowed: tuple[int, ...], model: str) -> tuple[float, ...]:
@@ -81,12 +90,20 @@ def _coefficients(distortion: Sequence[float], allowed: tuple[int, ...], model: 
         raise PerceptionError(f"{model} takes {choices} distortion coefficients, not {len(values)}")
     if not np.isfinite(values).all():
         raise PerceptionError(f"distortion coefficients must be finite, not {values}")
+    if any(abs(value) > LARGEST_NUMBER for value in values):
+        raise PerceptionError(
+            f"distortion coefficients must lie within {LARGEST_NUMBER:g} of 0, not {values}"
+        )
     return values
 
 
 def _first_positive_root(coefficients: npt.ArrayLike, limit: float) -> float:
     """Smallest positive real root of a polynomial, highest power first; `limit` where none is below it."""
-    roots = np.roots(np.asarray(coefficients, dtype=np.float64))
+    polynomial = np.asarray(coefficients, dtype=np.float64)
+    # A term that changes nothing below the limit is left out: its roots lie beyond every number.
+    terms = np.abs(polynomial) * limit ** np.arange(len(polynomial) - 1, -1, -1)
+    polynomial = np.where(terms > NO_TERM * terms.max(), polynomial, 0.0)
+    roots = np.roots(polynomial)
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
     return float(min(real.min(initial=limit), limit))
 

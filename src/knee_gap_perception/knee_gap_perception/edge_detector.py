@@ -80,9 +80,11 @@ class GapEdgeDetector:
             return float("nan")
         return float(np.mean([point.distance for point in self._track.points]))
 
-    def end_track(self) -> None:
-        """Forget the points; the next image starts a new track."""
+    def end_track(self) -> bool:
+        """Forget the points, so that the next image starts a new track; return whether there were any."""
+        ended = self._track is not None
         self._track = None
+        return ended
 
     def start_anew(self) -> None:
         """Forget the points, what was clicked, and what earlier images said of a gap."""

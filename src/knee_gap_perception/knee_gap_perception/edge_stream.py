@@ -26,6 +26,7 @@ from knee_gap_perception.messages import (
     image_from_compressed,
     image_from_message,
     lens_pose_from_message,
+    refuse_stamp,
     stamp_ns,
 )
 from knee_gap_perception.notch_follower import NotchFollower, NotchSight
@@ -95,6 +96,10 @@ class EdgeStream:
             self._notch = NotchFollower(calibration.require_notch())
         self._poses = LensPosePredictor(LONGEST_FRAME_NS) if by_notch else LensPosePredictor()
         self._waiting: deque[_Waiting] = deque()
+        # Of the lens poses; None before the first.
+        self._segment: int | None = None
+        # The image that is being looked at, and is not answered yet.
+        self._unanswered: _Waiting | None = None
 
     @property
     def by_notch(self) -> bool:
@@ -148,6 +153,7 @@ class EdgeStream:
         if self._notch is None:
             self._waiting.append(_Waiting(message, stamp, now_ns))
             return None
+        self._unanswered = _Waiting(message, stamp, now_ns)
         image = None
         try:
             image = _read(message)
@@ -157,6 +163,7 @@ class EdgeStream:
             sight = NotchSight(stamp, nan, nan, str(error))
         self.counts["the notch is seen" if sight.seen else f"no turn of the scope: {sight.reason}"] += 1
         self._waiting.append(_Waiting(message, stamp, now_ns, image, sight.seen))
+        self._unanswered = None
         return sight
 
     def ready(self, now_ns: int = 0) -> Iterator[GapEdges]:
@@ -179,7 +186,21 @@ class EdgeStream:
         while self._waiting:
             yield self._look(self._waiting.popleft())
 
+    def recover(self, reason: str) -> list[GapEdges]:
+        """Start afresh after an exception: end the track and forget the lens poses, the camera stays.
+
+        Returns what is said of the image in whose course it came, if there was one.
+        """
+        self.detector.start_anew()
+        self._poses.clear()
+        if (waiting := self._unanswered) is None:
+            return []
+        frame_id = str(waiting.message.header.frame_id)
+        edges = GapEdges.without_points(waiting.stamp_ns, frame_id, EdgeStatus.UNKNOWN)
+        return [self._answered(edges, reason)]
+
     def _look(self, waiting: _Waiting) -> GapEdges:
+        self._unanswered = waiting
         stamp, frame_id = waiting.stamp_ns, str(waiting.message.header.frame_id)
         self._image = None
         try:
@@ -189,15 +210,21 @@ class EdgeStream:
             if self._camera is None:
                 raise PerceptionError(self._camera_flaw)
             lens_pose = self._poses.at(stamp)
+            self._settle_segment(stamp)
             edges = self.detector.process(stamp, image, self._camera, lens_pose, frame_id=frame_id)
             if self._bearing_errors is not None and np.isfinite(edges.bearings).all():
                 edges = replace(edges, camera_errors=self._bearing_errors.of(edges.bearings))
-            self.reason = self.detector.reason
+            reason = self.detector.reason
         except PerceptionError as error:
             self.detector.end_track()
             edges = GapEdges.without_points(stamp, frame_id, EdgeStatus.UNKNOWN)
-            self.reason = str(error)
-        self.latest = edges
+            reason = str(error)
+        return self._answered(edges, reason)
+
+    def _answered(self, edges: GapEdges, reason: str) -> GapEdges:
+        """The edges of an image, noted and counted with the reason why they are not valid."""
+        self._unanswered = None
+        self.latest, self.reason = edges, reason
         self.last_refusal = self.reason or self.last_refusal
         self.counts[edges.status.name] += 1
         if edges.pose_used:
@@ -205,6 +232,19 @@ class EdgeStream:
         if edges.status is EdgeStatus.VALID and any(edges.hidden):
             self.counts["VALID, a point hidden"] += 1
         return edges
+
+    def _settle_segment(self, stamp: int) -> None:
+        """End the track where the lens poses up to an image do not follow from those before.
+
+        A body that slipped while nobody saw it comes back with sound poses: the views before and after are
+        not of one frame, so their points must not pass for the same two.
+        """
+        segment = self._poses.segment_at(stamp)
+        if segment is None or segment == self._segment:
+            return
+        if self._segment is not None and self.detector.end_track():
+            self.counts[f"tracks ended: {self._poses.break_reason}"] += 1
+        self._segment = segment
 
     def _refuse_other_size(self, image: Image) -> None:
         self.size_flaw = ""
@@ -237,4 +277,5 @@ class EdgeStream:
 
 
 def _read(message: Any) -> Image:
+    refuse_stamp(message.header)
     return image_from_compressed(message) if hasattr(message, "format") else image_from_message(message)

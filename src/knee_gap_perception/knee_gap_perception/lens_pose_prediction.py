@@ -5,11 +5,13 @@ for the points in the image, so a pose with a larger, honest covariance is bette
 """
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from knee_gap_node.pose_continuity import PoseContinuity
 from knee_gap_perception.poses import LensPose
 
 Array = npt.NDArray[np.float64]
@@ -28,6 +30,12 @@ class LensPosePredictor:
         """`longest_step_ns`: the longest time between poses, and from the last to the stamp asked for."""
         self._longest_step_ns = longest_step_ns
         self._poses: deque[LensPose] = deque(maxlen=KEPT)
+        self._continuity = PoseContinuity()
+
+    @property
+    def break_reason(self) -> str:
+        """Why the latest segment of poses began; empty for the first."""
+        return self._continuity.reason
 
     def add(self, pose: LensPose) -> None:
         """Take the next pose; one of another frame, or from before the last, starts anew."""
@@ -35,7 +43,22 @@ class LensPosePredictor:
             last = self._poses[-1]
             if pose.frame_id != last.frame_id or pose.stamp_ns <= last.stamp_ns:
                 self._poses.clear()
-        self._poses.append(pose)
+        segment = self._continuity.take(
+            pose.stamp_ns, pose.frame_id, pose.position, pose.quaternion_xyzw, pose.covariance
+        )
+        self._poses.append(replace(pose, segment=segment))
+
+    def clear(self) -> None:
+        """Forget all poses; their segments are numbered on."""
+        self._poses.clear()
+
+    def segment_at(self, stamp_ns: int) -> int | None:
+        """Segment of the latest pose up to a stamp [ns]; None where no pose is as old.
+
+        Poses of one segment follow from each other as those of a hand do, see `pose_continuity`.
+        """
+        segments = (pose.segment for pose in reversed(self._poses) if pose.stamp_ns <= stamp_ns)
+        return next(segments, None)
 
     def expects_after(self, stamp_ns: int) -> bool:
         """Whether a pose after a stamp [ns] is still to come, from a tracker that has not fallen silent."""
@@ -85,6 +108,8 @@ class LensPosePredictor:
         motion = [self._poses[end - 1]]
         for index in range(end - 2, max(end - 1 - wanted, -1), -1):
             if motion[0].stamp_ns - self._poses[index].stamp_ns > self._longest_step_ns:
+                break
+            if motion[0].segment != self._poses[index].segment:
                 break
             motion.insert(0, self._poses[index])
         return motion

@@ -22,6 +22,7 @@ SLOPE_SPREAD = 1.5  # [-] standard deviation of the tangent of the surface's sla
 SHAPE_NOISE = 0.03  # [-] of a patch's shape: the surface is not a plane
 MEMORY = 0.15  # [-] travel, against the distance, over which registrations are taken for one observation
 LEAST_TRAVEL = 0.01  # [-] travel, against the distance, from which a registration tells anything new
+FARTHEST_PX = 1e6  # [px] from the image, beyond which a prediction is none
 DIFFERENCE = 4.0  # [px] between the points whose images give the shape
 
 
@@ -72,7 +73,17 @@ class LocalPlane:
         self._prior_information = np.linalg.inv(self.covariance)
 
     def predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
-        """Where a patch of an earlier view is seen from another; None outside the camera's model."""
+        """Where a patch of an earlier view is seen from another; None outside the camera's model.
+
+        None as well where the numbers lead to none, as with poses that no tracker gives.
+        """
+        with np.errstate(all="ignore"):
+            prediction = self._predict(camera, anchor, anchor_pixel, view)
+        if prediction is None or not np.isfinite(prediction.covariance).all():
+            return None
+        return prediction if np.abs(prediction.warp.position).max() < FARTHEST_PX else None
+
+    def _predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
         corners = anchor_pixel + DIFFERENCE * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
         bearings = camera.bearings(corners)
         step = 0.01 / TYPICAL_DISTANCE
@@ -104,18 +115,28 @@ class LocalPlane:
         if moved < LEAST_TRAVEL:
             return
         self._learnt_at = lens
-        kept = float(np.exp(-moved / MEMORY))
+        try:
+            learnt = self._learnt(prediction, found, covariance, float(np.exp(-moved / MEMORY)))
+        except np.linalg.LinAlgError:
+            return  # nothing can be learnt from numbers that are singular to the last digit
+        if all(np.isfinite(values).all() for values in learnt):
+            self.mean, self.covariance = learnt
+
+    def _learnt(
+        self, prediction: Prediction, found: Array, covariance: Array, kept: float
+    ) -> tuple[Array, Array]:
+        """The mean and covariance of the plane after a registration, `kept` [0, 1] of what was known."""
         prior = np.linalg.inv(prediction.covariance)
         told = (1.0 - kept) * (np.linalg.inv(covariance) - prior)
         predicted = np.concatenate([prediction.warp.position, prediction.warp.shape.reshape(-1)])
         posterior = np.linalg.inv(prior + told)
         change = (1.0 - kept) * posterior @ np.linalg.solve(covariance, found - predicted)
         gain = self.covariance @ prediction.jacobian.T @ prior
-        self.mean = self.mean + gain @ change
+        mean = self.mean + gain @ change
         updated = self.covariance - gain @ (prediction.covariance - posterior) @ gain.T
         information = kept * np.linalg.inv((updated + updated.T) / 2) + (1.0 - kept) * self._prior_information
         loosened = np.linalg.inv(information)
-        self.covariance = (loosened + loosened.T) / 2
+        return mean, (loosened + loosened.T) / 2
 
     def _see(self, plane: Array, bearings: Array, anchor: View, view: View) -> Array:
         """Directions (n, 3) from a view of the plane's points that an anchor sees along bearings (n, 3)."""

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from knee_gap_perception.edges import GapEdges, SectionEdges
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.poses import LensPose
+from knee_gap_perception.poses import FARTHEST, LensPose, is_unit
 
 Image = npt.NDArray[np.uint8]
 
@@ -26,8 +26,14 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def stamp_ns(header: Any) -> int:
-    """Stamp of a std_msgs/Header [ns]."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    """Stamp of a std_msgs/Header [ns]; nanoseconds of a second and more count as the last of it."""
+    return int(header.stamp.sec) * 1_000_000_000 + min(int(header.stamp.nanosec), 999_999_999)
+
+
+def refuse_stamp(header: Any) -> None:
+    """Raise PerceptionError for a stamp whose nanoseconds are a second or more: it is no time."""
+    if int(header.stamp.nanosec) > 999_999_999:
+        raise PerceptionError(f"a stamp's nanoseconds must be below 1000000000, not {header.stamp.nanosec}")
 
 
 def _refuse_encoding(encoding: str) -> None:
@@ -108,15 +114,20 @@ def image_from_compressed(message: Any) -> Image:
 def lens_pose_from_message(message: Any) -> LensPose:
     """Lens pose of a geometry_msgs/PoseWithCovarianceStamped.
 
-    Raises PerceptionError for numbers that are not finite and for a quaternion of no length.
+    Raises PerceptionError for an invalid stamp, numbers that are not finite or beyond any tracker's, and a
+    quaternion that is not of unit length.
     """
+    refuse_stamp(message.header)
     place, turn = message.pose.pose.position, message.pose.pose.orientation
     position = np.array([place.x, place.y, place.z], dtype=np.float64)
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
-    finite = all(np.isfinite(values).all() for values in (position, quaternion, covariance))
-    if not finite or np.linalg.norm(quaternion) < 0.5:
-        raise PerceptionError(f"a lens pose must be finite and turned by a unit quaternion, not {quaternion}")
+    if not np.isfinite(np.concatenate([position, quaternion, covariance.ravel()])).all():
+        raise PerceptionError("a lens pose must be finite")
+    if not is_unit(quaternion):
+        raise PerceptionError(f"a lens pose must be turned by a unit quaternion, not {quaternion}")
+    if np.abs(position).max() > FARTHEST or np.abs(covariance).max() > FARTHEST**2:
+        raise PerceptionError(f"a lens pose and its error must lie within {FARTHEST:g} m, not {position} m")
     return LensPose(
         stamp_ns=stamp_ns(message.header),
         frame_id=str(message.header.frame_id),

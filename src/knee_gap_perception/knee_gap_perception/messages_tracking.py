@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.messages import stamp_ns
 from knee_gap_perception.notch_follower import NotchSight
 from knee_gap_perception.poses import BodyPose, LensPose
 
@@ -16,7 +17,7 @@ def body_pose_from_message(message: Any, name: str = "") -> BodyPose:
     """Body of a geometry_msgs/PoseStamped, unchecked, as a driver of the tracker publishes it."""
     position, orientation = message.pose.position, message.pose.orientation
     return BodyPose(
-        stamp_ns=int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec),
+        stamp_ns=stamp_ns(message.header),
         position=np.array([position.x, position.y, position.z], dtype=np.float64),
         quaternion_xyzw=np.array(
             [orientation.x, orientation.y, orientation.z, orientation.w], dtype=np.float64
@@ -88,7 +89,7 @@ def fill_scope_notch(message: Any, sight: NotchSight, frame_id: str) -> Any:
 
 def notch_from_message(message: Any) -> NotchSight:
     """The sight of a knee_gap_msgs/ScopeNotch; numbers that are none are no sight, whatever it says."""
-    stamp = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+    stamp = stamp_ns(message.header)
     reason = "" if message.seen else str(message.reason) or NOT_TOLD
     angle, error = float(message.angle), float(message.angle_error)
     if not reason and not (isfinite(angle) and isfinite(error) and error >= 0.0):

@@ -52,6 +52,7 @@ PARALLAX_ERROR = {  # [-] of the parallax, along it and across it
 MOTION_ERROR = 4.0  # [px] by which a hand departs from even motion within an image, without a pose
 SHAPE_ERROR = 0.06  # [-] by which the shape changes within an image, without a pose
 MAXIMUM_PATCHES = 24
+MOST_STRAIN = 2.5  # change of a predicted shape beyond which no patch is looked for
 MOST_STRETCH = 1.8  # [-] of the window of the local mean and contrast with the patch
 
 
@@ -132,21 +133,33 @@ class PointTrack:
     def follow(self, grey: Image, camera: Camera, view: View | None) -> Sighting:
         """The point in the next image (h, w), and the view it was taken from where that is known."""
         predictions = {index: self._predict(index, camera, view) for index in self._candidates()}
-        centre = next(iter(predictions.values())).warp.position
         best: tuple[int, Registration] | None = None
         for index, prediction in predictions.items():
             anchor = self._anchors[index]
-            surface = self._surface(grey, centre, prediction.warp.shape)
-            start = self._coarse(anchor.patch, surface, prediction)
-            found = anchor.patch.find(surface, start, prediction.covariance)
-            believed = _believable(found, prediction, self._fair(view, prediction))
+            found = self._find(anchor.patch, prediction, grey)
+            believed = found is not None and _believable(found, prediction, self._fair(view, prediction))
             anchor.rest = 0 if believed else REST
-            if believed:
+            if found is not None and believed:
                 best = (index, found)
                 break
         if best is None:
             return self._coast(predictions[len(self._anchors) - 1])
         return self._accept(best[0], best[1], predictions[best[0]], grey, view)
+
+    def _find(self, patch: Patch, prediction: Prediction, grey: Image) -> Registration | None:
+        """The patch where it is predicted; None where nothing can be seen of it there.
+
+        Each prediction has a crop of its own: those of two patches may lie far apart, as after poses that
+        were wrong, or that came back elsewhere.
+        """
+        if not _can_be_seen(prediction, grey):
+            return None
+        surface = self._surface(grey, prediction.warp.position, prediction.warp.shape)
+        try:
+            start = self._coarse(patch, surface, prediction)
+            return patch.find(surface, start, prediction.covariance)
+        except np.linalg.LinAlgError:
+            return None  # a covariance or shape that is singular to the last digit
 
     def _surface(self, grey: Image, centre: Array, shape: Array) -> Surface:
         """Texture around a pixel, taken through a window of the patch's shape (2, 2) there.
@@ -271,6 +284,17 @@ def _strain(shape: Array) -> float:
         return float("inf")
     turn = abs(np.arctan2(shape[1, 0] - shape[0, 1], shape[0, 0] + shape[1, 1]))
     return float(max(np.abs(np.log(stretches)).max(), turn))
+
+
+def _can_be_seen(prediction: Prediction, grey: Image) -> bool:
+    """Whether a patch may be looked for where it is predicted: near the image, and not squeezed to a line."""
+    position, shape = prediction.warp.position, prediction.warp.shape
+    numbers = (position, shape, prediction.covariance)
+    if not all(np.isfinite(values).all() for values in numbers):
+        return False
+    size = np.array([grey.shape[1], grey.shape[0]])
+    near = bool((position > -CROP_HALF).all() and (position < size + CROP_HALF).all())
+    return near and _strain(shape) < MOST_STRAIN
 
 
 def _believable(found: Registration, prediction: Prediction, fair: float) -> bool:

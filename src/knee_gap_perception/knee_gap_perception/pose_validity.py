@@ -10,7 +10,7 @@ from statistics import median
 import numpy as np
 
 from knee_gap_perception.parameters import check_parameters
-from knee_gap_perception.poses import BodyPose
+from knee_gap_perception.poses import FARTHEST, BodyPose, is_place
 from knee_gap_perception.swapped_bodies import SwappedBodies
 
 # A body that jumped away, or was not seen, is taken back within what the fastest motion reaches in this time
@@ -30,6 +30,7 @@ class RefusalReason(StrEnum):
     NOT_TRACKED = "not_tracked"
     NOT_FINITE = "not_finite"
     NOT_UNIT = "not_unit"
+    TOO_FAR = "too_far"
     MEAN_ERROR = "mean_error"
     FROZEN = "frozen"
     SWAPPED = "swapped"
@@ -182,7 +183,10 @@ class PoseValidity:
             return RefusalReason.NOT_TRACKED, "the tracker does not see the body"
         if not (np.isfinite(body.position).all() and np.isfinite(body.quaternion_xyzw).all()):
             return RefusalReason.NOT_FINITE, "the pose has numbers that are NaN or infinite"
-        length = float(np.linalg.norm(body.quaternion_xyzw))
+        if not is_place(body.position):
+            return RefusalReason.TOO_FAR, f"the body is farther than {FARTHEST:g} m: are positions in metres?"
+        # Clipped before it is squared, which overflows.
+        length = float(np.linalg.norm(np.clip(body.quaternion_xyzw, -1e6, 1e6)))
         if abs(length - 1.0) > limits.quaternion_tolerance:
             return (
                 RefusalReason.NOT_UNIT,

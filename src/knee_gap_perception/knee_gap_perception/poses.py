@@ -9,6 +9,10 @@ from scipy.spatial.transform import Rotation
 
 Array = npt.NDArray[np.float64]
 
+# No tracker sees farther [m]; what lies beyond is no place, and its square may be no number.
+FARTHEST = 1000.0
+UNIT_TOLERANCE = 1e-3  # [-] by which a quaternion's length may differ from 1
+
 
 @dataclass(frozen=True, eq=False)
 class BodyPose:
@@ -36,7 +40,8 @@ class LensPose:
     `position` (3,) [m] and `quaternion_xyzw` (4,) map coordinates of `child_frame_id` (z along the view, x to
     the right, y down) to `frame_id`. `covariance` (6, 6) is that of position [m^2] and of a small rotation
     [rad^2] about the fixed axes of `frame_id`, in the order x, y, z, rotation about x, y, z (REP-103).
-    `scope_turn` [rad] is how far the scope is turned in its camera head since its calibration.
+    `scope_turn` [rad] is how far the scope is turned in its camera head since its calibration. `segment`
+    counts the breaks in the poses before it, where somebody follows them: see `pose_continuity`.
     """
 
     stamp_ns: int
@@ -46,6 +51,7 @@ class LensPose:
     quaternion_xyzw: Array
     covariance: Array
     scope_turn: float = 0.0
+    segment: int = 0
 
     def matrix(self) -> Array:
         """Return the pose as `T_world_lens` (4, 4), which maps lens coordinates to `frame_id`."""
@@ -58,6 +64,19 @@ def rigid_transform(position: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> 
     T[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
     T[:3, 3] = position
     return T
+
+
+def is_unit(quaternion: Array) -> bool:
+    """Whether a quaternion (4,) is of unit length, within what rounding and drivers leave."""
+    # Compared before it is squared, which overflows.
+    if not np.abs(quaternion).max() <= 2.0:
+        return False
+    return abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT_TOLERANCE
+
+
+def is_place(position: Array) -> bool:
+    """Whether a position (3,) [m] is finite, and not farther than any tracker sees."""
+    return bool(np.abs(position).max() <= FARTHEST)
 
 
 def cross_matrix(vector: Array) -> Array:

@@ -12,12 +12,14 @@ from std_srvs.srv import Trigger
 
 from knee_gap_msgs.msg import GapEdges, GapSection, ScopeCalibration, ScopeNotch
 from knee_gap_msgs.srv import ChoosePoint
-from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.seam import Fault
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeStatus
+from knee_gap_perception.edges import GapEdges as Edges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
@@ -62,7 +64,11 @@ class SegmentationNode(BaseNode):
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
         self.create_service(Trigger, "start_anew", self.on_start_anew)
         self._poses = self.create_subscription(
-            PoseWithCovarianceStamped, "scope_pose", self.on_pose, TRACKER_QOS
+            # Reliable: lost on the way, poses would leave a gap that ends the track.
+            PoseWithCovarianceStamped,
+            "scope_pose",
+            self.on_pose,
+            RESULT_QOS,
         )
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
@@ -89,18 +95,33 @@ class SegmentationNode(BaseNode):
         """Publish the edges in the images that wait no longer, and the pictures that anybody wants."""
         self.take_waiting_poses()
         for edges in self._stream.ready(self.now_ns()):
-            message = fill_gap_edges(GapEdges(), edges, GapSection)
-            self._edges.publish(message)
-            if self._stream.reason:
-                self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
+            message = self.publish_edges(edges)
             if self._mask.get_subscription_count() and (mask := self._stream.mask()) is not None:
                 self.publish_picture(self._mask, mask, "mono8", message)
             if self._overlay.get_subscription_count() and (drawn := self._stream.overlay()) is not None:
                 self.publish_picture(self._overlay, drawn, "bgr8", message)
+        self.set_patience()
+
+    def publish_edges(self, edges: Edges) -> GapEdges:
+        """Publish what was found in one image; returns the message."""
+        message = fill_gap_edges(GapEdges(), edges, GapSection)
+        self._edges.publish(message)
+        if self._stream.reason:
+            self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")
+        return message
+
+    def set_patience(self) -> None:
+        """Let the timer run while an image waits."""
         if not self._stream.waiting:
             self._patience.cancel()
         elif self._patience.is_canceled():
             self._patience.reset()
+
+    def recover(self, fault: Fault) -> None:
+        """Start the stream afresh, and say of the image that raised that nothing is known of it."""
+        for edges in self._stream.recover(fault.reason):
+            self.publish_edges(edges)
+        self.set_patience()
 
     def take_waiting_poses(self) -> None:
         """Take all poses that are there.

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from knee_gap_perception.poses import Array, BodyPose
+from knee_gap_perception.poses import Array, BodyPose, is_place
 
 # A label is on another body when it is this many times nearer to that body's last place than to its own.
 MUCH_NEARER = 4.0
@@ -26,9 +26,7 @@ class SwappedBodies:
 
     def update(self, bodies: Iterable[BodyPose]) -> dict[str, str]:
         """Take the bodies of one frame; return, for each label that is on another body, that body's name."""
-        seen = {
-            body.name: body for body in bodies if body.tracking_valid and np.isfinite(body.position).all()
-        }
+        seen = {body.name: body for body in bodies if body.tracking_valid and is_place(body.position)}
         claims = {label: claim for label, body in seen.items() if (claim := self._claim(label, body))}
         # A body that is seen where it was, under its own name, is not to be had by another label.
         while taken := [label for label, claim in claims.items() if claim in seen and claim not in claims]:

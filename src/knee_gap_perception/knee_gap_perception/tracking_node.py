@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.seam import Fault
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import (
@@ -116,8 +117,13 @@ class TrackingNode(BaseNode):
 
     def receive(self) -> None:
         """Publish what Motive sends, until the node ends; in a thread of its own, because it waits."""
+        poll = self.guarded("frame of NatNet", partial(self.publish_polled, NATNET_WAIT))
         while not self._ended.is_set():
-            self.publish_polled(NATNET_WAIT)
+            faults = self.seam.counts.total()
+            poll()
+            if self.seam.counts.total() > faults:
+                # What raises at once whenever it is looked at must not take the whole processor.
+                self._ended.wait(NATNET_WAIT)
 
     def publish_polled(self, timeout: float) -> None:
         """Publish the lens pose of each new frame, or log why there is none."""
@@ -129,6 +135,12 @@ class TrackingNode(BaseNode):
         """Take where the notch is in an image, and publish the pose of the lens at its stamp."""
         with self._one_at_a_time:
             self.publish_lenses(self._tracker.take_notch(notch_from_message(message)))
+
+    def recover(self, fault: Fault) -> None:
+        """Start the tracker afresh; the pose that raised is not published."""
+        with self._one_at_a_time:
+            self._tracker.reset()
+        self._refused, self._why_refused = self._refused + 1, fault.reason
 
     def publish_lenses(self, lenses: Iterable[LensPose | Refusal]) -> None:
         """Publish poses of the lens, and log why there are none."""

@@ -3,12 +3,15 @@
 What passes from core to core passes as messages, as it does between the nodes.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_node.seam import Fault, Seam
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
@@ -44,6 +47,7 @@ from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.motion_advice import AdviceParameters
 
+_LOG = logging.getLogger(__name__)
 _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 
 
@@ -138,6 +142,8 @@ class GapPipeline:
             for node, calibration in used.items()
             if any(used.values())
         ]
+        # As in the nodes: what a core raises refuses one message, and that core starts afresh.
+        self._seam = Seam(self._log_fault)
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still where they run backwards.
         self._now_ns = 0
@@ -180,47 +186,74 @@ class GapPipeline:
         self._newest_stamp_ns = stamp_ns
         # Before the message is taken: what it could not wait for any longer is without it, as live.
         yield from self._looked_at(self._detector.ready(self._now_ns))
-        yield from self._published(self._estimator.advance(self._now_ns))
+        yield from self._estimated("time", lambda: self._estimator.advance(self._now_ns))
         yield from self._advice()
+        what = f"message on {topic}"
         if topic == self._topics.camera_info:
-            self._detector.on_camera_info(message)
+            yield from self._segmented(what, lambda: self._detector.on_camera_info(message))
         elif topic in self._leg_body:
-            self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
+            yield from self._estimated(what, lambda: self._on_leg_pose(message))
         elif topic in self._body_names:
-            yield from self._on_body_pose(self._body_names[topic], message)
+            name = self._body_names[topic]
+            yield from self._on_lenses(
+                self._seam.call(what, self._restart_tracker, lambda: self._tracked(name, message))
+            )
         else:
-            sight = self._detector.on_image(message, self._now_ns)
-            if sight is not None:
-                yield from self._on_notch(sight, str(message.header.frame_id))
+            yield from self._on_image(what, message)
         yield from self._looked_at(self._detector.ready(self._now_ns))
 
     def flaws(self) -> list[str]:
-        """What about the calibration kept all results from being valid, a line each."""
+        """What about the calibration kept all results from being valid, and what raised, a line each."""
         size = self._detector.size_flaw
-        return [flaw for flaw in (self._estimator.calibration_flaw, size) if flaw]
+        faults = [f"{count} times {fault}" for fault, count in self._seam.counts.items()]
+        return [flaw for flaw in (self._estimator.calibration_flaw, size, *faults) if flaw]
 
     def finish(self) -> Iterable[Output]:
         """Return the edges and estimates of images whose lens pose will not come any more."""
-        yield from self._looked_at(self._detector.finish())
+        faults = -1
+        while faults < self._seam.counts.total():
+            # Again where an image raised, for those behind it.
+            faults = self._seam.counts.total()
+            yield from self._looked_at(self._detector.finish())
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
-        yield from self._published(self._estimator.advance(self._now_ns + wait_ns + 1))
+        yield from self._estimated("end", lambda: self._estimator.advance(self._now_ns + wait_ns + 1))
 
     def _told_calibrations(self, stamp_ns: int) -> Iterator[Output]:
         for told in self._calibrations:
             self._estimator.add_calibration(messages.calibration_from_message(told))
             yield Output(self._topic("scope_calibration"), told, stamp_ns)
 
-    def _on_body_pose(self, name: str, message: Any) -> Iterator[Output]:
+    def _tracked(self, name: str, message: Any) -> list[LensPose | Refusal]:
         self._bodies.put(name, message)
+        lenses: list[LensPose | Refusal] = []
         for frame in self._bodies.poll():
             body, others = choose_body(frame, SCOPE)
             if body is not None:
-                yield from self._on_lenses(self._tracker.take(body, others))
+                lenses += self._tracker.take(body, others)
+        return lenses
+
+    def _on_leg_pose(self, message: Any) -> list[GapEstimate]:
+        self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
+        return []
+
+    def _on_image(self, what: str, message: Any) -> Iterator[Output]:
+        sights: list[NotchSight] = []
+
+        def look() -> None:
+            if (sight := self._detector.on_image(message, self._now_ns)) is not None:
+                sights.append(sight)
+
+        yield from self._segmented(what, look)
+        for sight in sights:
+            yield from self._on_notch(sight, str(message.header.frame_id))
 
     def _on_notch(self, sight: NotchSight, frame_id: str) -> Iterator[Output]:
         told = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), sight, frame_id)
         yield Output(self._topic("scope_notch"), told, sight.stamp_ns)
-        yield from self._on_lenses(self._tracker.take_notch(notch_from_message(told)))
+        sight = notch_from_message(told)
+        yield from self._on_lenses(
+            self._seam.call("notch", self._restart_tracker, lambda: self._tracker.take_notch(sight))
+        )
 
     def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output]:
         for lens in lenses:
@@ -229,24 +262,55 @@ class GapPipeline:
             if self._tracker.follows_turn:
                 turn = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), lens)
                 yield Output(self._topic("scope_turn"), turn, lens.stamp_ns)
-                told = messages.turn_from_message(turn)
-                yield from self._published(self._estimator.add_turn(told, self._now_ns))
+                yield from self._estimated("scope_turn", partial(self._on_turn, turn))
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
-            estimates = self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
-            yield from self._published(estimates)
-            self._detector.on_lens_pose(pose)
+            yield from self._estimated("scope_pose", partial(self._on_pose, pose))
+            yield from self._segmented("scope_pose", partial(self._detector.on_lens_pose, pose))
+
+    def _on_turn(self, turn: Any) -> list[GapEstimate]:
+        return self._estimator.add_turn(messages.turn_from_message(turn), self._now_ns)
+
+    def _on_pose(self, pose: Any) -> list[GapEstimate]:
+        return self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
+
+    def _on_edges(self, edges: Any) -> list[GapEstimate]:
+        return self._estimator.add_edges(messages.edges_from_message(edges), self._now_ns)
+
+    def _estimated(self, what: str, call: Callable[[], list[GapEstimate]]) -> Iterator[Output]:
+        """What the estimator answers."""
+        answer = self._seam.call(what, lambda fault: self._estimator.recover(fault.reason), call)
+        return self._published(answer)
+
+    def _segmented(self, what: str, call: Callable[[], None]) -> Iterator[Output]:
+        """Hand something to the edge stream; what follows is empty unless it raises."""
+
+        def nothing() -> list[GapEdges]:
+            call()
+            return []
+
+        return self._looked_at(self._seam.call(what, self._restart_detector, nothing))
+
+    def _restart_detector(self, fault: Fault) -> list[GapEdges]:
+        return self._detector.recover(fault.reason)
+
+    def _restart_tracker(self, _: Fault) -> list[LensPose | Refusal]:
+        self._tracker.reset()
+        return []
+
+    @staticmethod
+    def _log_fault(fault: Fault) -> None:
+        _LOG.debug(fault.traceback)
 
     def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output]:
-        for edges in images:
+        for edges in self._seam.each("image", self._restart_detector, images):
             edges_message = fill_gap_edges(
                 blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
             )
             yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
             if self._with_mask and (mask := self._detector.mask()) is not None:
                 yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)
-            observation = messages.edges_from_message(edges_message)
-            yield from self._published(self._estimator.add_edges(observation, self._now_ns))
+            yield from self._estimated("gap_edges", partial(self._on_edges, edges_message))
 
     def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
         for estimate in estimates:

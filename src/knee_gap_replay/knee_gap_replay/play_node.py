@@ -11,7 +11,6 @@ import rclpy
 from rclpy.clock import ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -19,6 +18,7 @@ from rclpy.time import Time
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
+from knee_gap_node.base_node import GuardedNode
 from knee_gap_node.parameters import refuse_unknown
 from knee_gap_replay import qos as qos_profiles
 from knee_gap_replay.bag import BagReader, Topic
@@ -35,7 +35,7 @@ _SETTLE_SECONDS = 0.2
 _ACKNOWLEDGE_SECONDS = 2.0
 
 
-class PlayNode(Node):
+class PlayNode(GuardedNode):
     """Publishers for the topics of a bag; skips, with one line each, what this machine has no type for."""
 
     def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:

@@ -12,7 +12,6 @@ import rclpy
 from rclpy.clock import ROSClock
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -21,6 +20,7 @@ from rclpy.utilities import remove_ros_args
 from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 
+from knee_gap_node.base_node import GuardedNode
 from knee_gap_node.parameters import refuse_unknown
 from knee_gap_replay.bag import BagMessage, BagWriter
 from knee_gap_replay.command_line import Parser, positive, run, stop_on_signals
@@ -35,7 +35,7 @@ _DEPTH = 256
 _LOOK_SECONDS = 0.02
 
 
-class RecordNode(Node):
+class RecordNode(GuardedNode):
     """Subscribes to each topic once somebody publishes it, as weakly as its weakest publisher offers."""
 
     def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
@@ -160,8 +160,10 @@ def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) ->
     lost = node.lost + writer.dropped
     for topic, count in sorted(lost.items()):
         _LOG.warning("%d messages of %s were lost", count, topic)
+    for fault, count in node.seam.counts.items():
+        _LOG.warning("%d: %s", count, fault)
     print(f"record: {sum(counts.values())} messages of {len(counts)} topics in {out}", flush=True)
-    return 1 if lost else 0
+    return 1 if lost or node.seam.counts else 0
 
 
 def _parser() -> Parser:

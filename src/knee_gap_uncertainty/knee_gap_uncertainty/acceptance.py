@@ -35,6 +35,7 @@ AGE_OF_A_RECORDING = 86_400.0
 class Reason(StrEnum):
     """Why an estimate is not VALID, in constant words: what is counted must be bounded."""
 
+    FAULT = "what was received made the estimator fail"
     NOTHING_YET = "no edges received yet"
     SILENCE = "no edges arrive"
     NOT_SEEN = "the image gave no usable edges"
@@ -91,7 +92,7 @@ class Kept(Enum):
 class Facts:
     """What is known of one image; the defaults are of what is not known yet.
 
-    `is_silent`: no image came for too long, or none at all so far (`is_first_awaited`). `clock_offset` [s] is
+    `fault`: what raised an exception, in words. `is_silent`: no image came for too long, or none at all so far (`is_first_awaited`). `clock_offset` [s] is
     how far the node's clock is ahead of the image's stamp, NaN where stamps are not held to a clock, and
     `delay` [s] how much longer than it has to the answer takes. `pose` and `turn` are those at the image, or
     why there is none. `needs_motion`: the clock has an error. `measured` is the estimate as it would be
@@ -101,6 +102,7 @@ class Facts:
     """
 
     parameters: EstimatorParameters
+    fault: str = ""
     is_silent: bool = False
     is_first_awaited: bool = False
     edges: EdgeObservation | None = None
@@ -155,6 +157,7 @@ def _is_short(estimate: GapEstimate, facts: Facts) -> bool:
 
 RULES: tuple[Rule, ...] = (
     # The image and its stamp.
+    Rule(Reason.FAULT, GapStatus.UNKNOWN, lambda f: bool(f.fault), detail=lambda f: f.fault),
     Rule(Reason.NOTHING_YET, GapStatus.UNKNOWN, lambda f: f.is_silent and f.is_first_awaited),
     Rule(Reason.SILENCE, GapStatus.NO_EDGES, lambda f: f.is_silent),
     Rule(

@@ -194,6 +194,21 @@ class GapEstimator:
         assert verdict is not None
         return self._without(max(stamp_ns, 0), 0, verdict)
 
+    def recover(self, reason: str) -> list[GapEstimate]:
+        """Start afresh after an exception: end the track and forget the poses; calibrations stay.
+
+        Returns what is said of the image whose turn it was, if one waited.
+        """
+        self._track = None
+        self._poses.clear()
+        self._advice_task = AdviceTask(self._advice_task.parameters)
+        if not self._pending:
+            return []
+        edges = self._pending.popleft().edges
+        verdict = judge(Facts(self.parameters, fault=reason))
+        assert verdict is not None
+        return [self._without(edges.stamp_ns, edges.track_id, verdict)]
+
     def _turn_clock(self, now_ns: int) -> None:
         """Take the time; where it runs backwards (a bag that starts again) nothing waits any longer."""
         if now_ns < self._now_ns:

@@ -11,6 +11,7 @@ from std_msgs.msg import Float64
 
 from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_node.seam import Fault
 from knee_gap_uncertainty import gap_estimate, messages
 from knee_gap_uncertainty.acceptance import Reason
 from knee_gap_uncertainty.advice_task import AdvicePace
@@ -126,6 +127,10 @@ class UncertaintyNode(BaseNode):
                 self.log_once(estimate.rejection.reason, f"{estimate.status.name}: {estimate.reason}")
         while self._estimator.profiles:
             self._profile.publish(messages.fill_gap_profile(GapProfile(), self._estimator.profiles.popleft()))
+
+    def recover(self, fault: Fault) -> None:
+        """Start the estimator afresh, and say of the image that raised that nothing is known of it."""
+        self.publish(self._estimator.recover(fault.reason))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""

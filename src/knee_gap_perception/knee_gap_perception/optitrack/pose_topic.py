@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from knee_gap_perception.messages_tracking import body_pose_from_message
 from knee_gap_perception.optitrack.body_source import BodyFrame, SourceStatus
 from knee_gap_perception.optitrack.up_axis import position_z_up, quaternion_z_up
-from knee_gap_perception.poses import BodyPose
+from knee_gap_perception.poses import BodyPose, is_place, is_unit
 
 MOST_WAITING = 64
 
@@ -91,10 +91,9 @@ class PoseTopics:
 
 
 def _between(before: BodyPose, after: BodyPose, stamp_ns: int) -> BodyPose | None:
-    numbers = np.concatenate([before.position, after.position, before.quaternion_xyzw, after.quaternion_xyzw])
-    quaternions = np.array([before.quaternion_xyzw, after.quaternion_xyzw])
-    if not np.isfinite(numbers).all() or (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > 1e-3).any():
+    if not all(is_place(body.position) and is_unit(body.quaternion_xyzw) for body in (before, after)):
         return None
+    quaternions = np.array([before.quaternion_xyzw, after.quaternion_xyzw])
     share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
     return BodyPose(
         stamp_ns=stamp_ns,
