@@ -17,15 +17,23 @@ from live import Client
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE
 
 DOMAIN = 51
 POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
 TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
 FRAME = 1 / 60
+# The views here are exact, and so is the scope.
+EXACT = [part for name in EXACT_SCOPE for part in ("-p", f"{name}:=0.0")]
+COMMAND = [
+    executable("knee_gap_uncertainty", "uncertainty_node"),
+    *("--ros-args", "-r", "__ns:=/knee_gap", *EXACT),
+]
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -53,13 +61,18 @@ def pose_message(stamp_ns: int, x: float) -> PoseWithCovarianceStamped:
     return message
 
 
+def stamp_of(message: GapEstimate) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
 class Track:
     """Feeds a scope that travels 6 mm in a second, and then stands still."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, behind: float = 0.0) -> None:
+        """`behind` [s]: how far its stamps are behind the clock."""
         self.client = client
         self.frame = 0
-        self.begin_ns = time.time_ns()
+        self.begin_ns = time.time_ns() - round(behind * 1e9)
 
     def run(self, frames: int, *, poses: bool = True, edges: bool = True) -> None:
         for _ in range(frames):
@@ -80,8 +93,7 @@ class Track:
 def processes(tmp_path: Path) -> Iterator[Processes]:
     environment = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with Processes(tmp_path, environment) as started:
-        command = [executable("knee_gap_uncertainty", "uncertainty_node")]
-        started.start("uncertainty_node", [*command, "--ros-args", "-r", "__ns:=/knee_gap"])
+        started.start("uncertainty_node", COMMAND)
         started.wait_ready(["uncertainty_node"], 120.0)
         yield started
 
@@ -102,7 +114,7 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     gap = client.received["gap"]
     track = Track(client)
     track.run(70)
-    client.spin_until(lambda: len(gap) >= 70)
+    client.spin_until(lambda: len([e for e in gap if e.track_id]) >= 70)
     good = [e for e in gap if e.status == GapEstimate.STATUS_VALID]
     assert len(good) > 40
     last = good[-1]
@@ -132,6 +144,67 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     assert len(silence) >= 4
     assert {e.status for e in silence} == {GapEstimate.STATUS_NO_EDGES}
     assert all(math.isnan(e.gap) for e in silence)
+
+
+def test_says_that_nothing_came_yet_from_its_start(client: Client) -> None:
+    gap = client.received["gap"]
+    client.spin(0.5)
+    assert len(gap) >= 4
+    assert {e.status for e in gap} == {GapEstimate.STATUS_UNKNOWN}
+
+
+@pytest.mark.parametrize("behind", [3600.0, -3600.0])
+def test_stamps_an_hour_from_the_clock_are_out_of_sync(client: Client, behind: float) -> None:
+    gap = client.received["gap"]
+    Track(client, behind).run(70)
+    client.spin(0.2)
+    answers = [e for e in gap if e.track_id]
+    assert len(answers) > 60
+    assert {e.status for e in answers} == {GapEstimate.STATUS_OUT_OF_SYNC}
+
+
+def test_node_that_was_stopped_gives_no_old_number(client: Client, processes: Processes) -> None:
+    gap = client.received["gap"]
+    track = Track(client)
+    track.run(70)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
+    os.kill(processes.pid("uncertainty_node"), signal.SIGSTOP)
+    track.run(60)
+    before, now = len(gap), time.time_ns()
+    os.kill(processes.pid("uncertainty_node"), signal.SIGCONT)
+    client.spin(0.3)
+    backlog = [e for e in gap[before:] if e.track_id and now - stamp_of(e) > 0.6e9]
+    assert backlog
+    assert GapEstimate.STATUS_VALID not in {e.status for e in backlog}
+    # What comes then is fresh, and measured.
+    before = len(gap)
+    track.run(20)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
+
+
+def test_silence_is_said_when_the_clock_stops_with_the_images(tmp_path: Path) -> None:
+    """By a bag's clock no time passes then; the last word must not stay VALID."""
+    environment = {"ROS_DOMAIN_ID": str(DOMAIN + 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with Processes(tmp_path, environment) as started, Client(DOMAIN + 100) as client:
+        started.start("uncertainty_node", [*COMMAND, "-p", "use_sim_time:=true"])
+        started.wait_ready(["uncertainty_node"], 120.0)
+        client.offer(Clock, "/clock")
+        client.offer(GapEdges, "gap_edges")
+        client.offer(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(GapEstimate, "gap")
+        client.wait_matched()
+        gap, track = client.received["gap"], Track(client, behind=1e8)
+        for _ in range(70):
+            clock = Clock()
+            clock.clock.sec, clock.clock.nanosec = divmod(
+                track.begin_ns + round(track.frame * FRAME * 1e9), 10**9
+            )
+            client.publish("/clock", clock)
+            track.run(1)
+        client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
+        client.spin(1.0)
+        assert gap[-1].status != GapEstimate.STATUS_VALID
+        assert len([e for e in gap if e.status == GapEstimate.STATUS_NO_EDGES]) >= 4
 
 
 def test_rubbish_is_survived(client: Client, processes: Processes) -> None:

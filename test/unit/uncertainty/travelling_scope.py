@@ -102,14 +102,18 @@ def observed(
 
 
 def estimates(
-    *calibrations: ScopeCalibration, camera: float = 0.0, turning: float = 0.3, scope_turn: float = 0.0
+    *calibrations: ScopeCalibration,
+    camera: float | None = 0.0,
+    turning: float = 0.3,
+    scope_turn: float = 0.0,
+    parameters: EstimatorParameters = EXACT,
 ) -> list[GapEstimate]:
     """What the estimator says of 40 views of the travelling scope, `camera` times its errors told.
 
-    It turns in its camera head by `scope_turn` [rad] on the way.
+    None tells no error of the camera. It turns in its camera head by `scope_turn` [rad] on the way.
     """
-    estimator, views, found = GapEstimator(EXACT), scope(40, turning), []
-    errors = camera * camera_errors(views, 0, 1, 2)
+    estimator, views, found = GapEstimator(parameters), scope(40, turning), []
+    errors = np.zeros((40, 2, 3, 0)) if camera is None else camera * camera_errors(views, 0, 1, 2)
     for calibration in calibrations:
         estimator.add_calibration(calibration)
     for k in range(40):
