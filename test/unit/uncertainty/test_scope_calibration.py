@@ -99,7 +99,8 @@ def test_what_was_not_calibrated_has_the_errors_that_the_parameters_state() -> N
 @pytest.mark.parametrize("name", list(EXACT_SCOPE))
 def test_both_intervals_include_what_was_not_calibrated(name: str) -> None:
     exact = moving(EXACT)
-    wide = moving(replace(EXACT, **{name: getattr(EstimatorParameters(), name)}))
+    # A share of it: the whole leaves nothing valid of so short a track.
+    wide = moving(replace(EXACT, **{name: 0.2 * getattr(EstimatorParameters(), name)}))
     assert exact.status is wide.status is GapStatus.VALID
     assert wide.gap == pytest.approx(exact.gap)
     for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
