@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from test_acceptance import TINY, travelling
+from travelling_scope import TINY, travelling
 
 from knee_gap_uncertainty.delays import ContinuedClock, DelayFloor
 from knee_gap_uncertainty.estimator import GapEstimator

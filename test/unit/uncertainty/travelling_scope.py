@@ -124,3 +124,24 @@ def estimates(
         estimator.add_pose(pose, stamp_ns)
         found += estimator.add_edges(edges, stamp_ns)
     return found
+
+
+# Errors far below any tracker's: only the rules stand between a short travel and VALID.
+TINY = EstimatorParameters(**EXACT_SCOPE, tracker_drift=0.0, tracker_angular_drift=0.0)
+
+
+def travelling(
+    estimator: GapEstimator, depth: float, travel: float, count: int = 40, sigma: float = 1e-5
+) -> list[GapEstimate]:
+    """Images from a lens that travels past two points, 4 mm apart at a depth [m]."""
+    points, found = np.array([[0.0, -0.002, depth], [0.0, 0.002, depth]]), []
+    for k, x in enumerate(np.linspace(0.0, travel, count)):
+        stamp = 10**9 + k * 16_666_667
+        place = np.array([x + 1e-10 * k, 0.0, 0.0])
+        pose = LensPose(stamp, "world", place, Rotation.identity().as_quat(), np.diag([1e-16] * 6))
+        bearings = points - place
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        edges = EdgeObservation(stamp, 1, True, bearings, bearing_covariances(bearings, sigma), 3.0 * sigma)
+        estimator.add_pose(pose, stamp)
+        found += estimator.add_edges(edges, stamp)
+    return found
