@@ -72,14 +72,18 @@ class Track:
         """`behind` [s]: how far its stamps are behind the clock."""
         self.client = client
         self.frame = 0
-        self.begin_ns = time.time_ns() - round(behind * 1e9)
+        self._behind_ns = round(behind * 1e9)
+
+    def now_ns(self) -> int:
+        """Stamp of an image that is exposed now: a busy machine must not make the stamps fall behind."""
+        return time.time_ns() - self._behind_ns
 
     def run(self, frames: int, *, poses: bool = True, edges: bool = True) -> None:
         for _ in range(frames):
             started = time.monotonic()
             # At rest as well a tracker's numbers change in their last digits.
             x = min(self.frame * 1e-4, 0.006) + 1e-9 * self.frame
-            stamp = self.begin_ns + round(self.frame * FRAME * 1e9)
+            stamp = self.now_ns()
             if poses:
                 self.client.publish("scope_pose", pose_message(stamp - 1_000_000, x))
                 self.client.publish("scope_pose", pose_message(stamp + 1_000_000, x))
@@ -196,22 +200,22 @@ def test_silence_is_said_when_the_clock_stops_with_the_images(tmp_path: Path) ->
         gap, track = client.received["gap"], Track(client, behind=1e8)
         for _ in range(70):
             clock = Clock()
-            clock.clock.sec, clock.clock.nanosec = divmod(
-                track.begin_ns + round(track.frame * FRAME * 1e9), 10**9
-            )
+            clock.clock.sec, clock.clock.nanosec = divmod(track.now_ns(), 10**9)
             client.publish("/clock", clock)
             track.run(1)
         client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
-        client.spin(1.0)
+        before = len(gap)
+        client.spin_until(
+            lambda: len([e for e in gap[before:] if e.status == GapEstimate.STATUS_NO_EDGES]) >= 4
+        )
         assert gap[-1].status != GapEstimate.STATUS_VALID
-        assert len([e for e in gap if e.status == GapEstimate.STATUS_NO_EDGES]) >= 4
 
 
 def test_rubbish_is_survived(client: Client, processes: Processes) -> None:
     track = Track(client)
     track.run(30)
     gap = client.received["gap"]
-    stamp = track.begin_ns + round(track.frame * FRAME * 1e9)
+    stamp = track.now_ns()
     broken = edges_message(stamp, 0.003)
     broken.bearing_0.x = math.nan
     client.publish("gap_edges", broken)
@@ -225,7 +229,7 @@ def test_rubbish_is_survived(client: Client, processes: Processes) -> None:
     processes.check("uncertainty_node")
     assert all(e.status != GapEstimate.STATUS_VALID for e in gap[-3:])
     # Time that ran backwards begins a new track, which measures as the first did.
-    again = Track(client)
+    again = Track(client, behind=5.0)
     before = len(gap)
     again.run(70)
     client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
