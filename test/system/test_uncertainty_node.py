@@ -130,8 +130,8 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     # The tracker goes: the first image without a pose already says so, and carries no number.
     before, numbers = len(gap), len(client.received["gap/min"])
     track.run(6, edges=True, poses=False)
-    client.spin_until(lambda: len(gap) >= before + 6)
-    lost = gap[before : before + 6]
+    client.spin_until(lambda: len([e for e in gap[before:] if e.track_id]) >= 6)
+    lost = [e for e in gap[before:] if e.track_id][:6]
     assert {e.status for e in lost} == {GapEstimate.STATUS_TRACKING_LOST}
     assert all(math.isnan(value) for e in lost for value in (e.gap, e.gap_min, e.gap_max, e.snr))
     assert len(client.received["gap/min"]) == numbers
@@ -173,11 +173,11 @@ def test_node_that_was_stopped_gives_no_old_number(client: Client, processes: Pr
     track.run(70)
     client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
     os.kill(processes.pid("uncertainty_node"), signal.SIGSTOP)
-    track.run(60)
+    track.run(120)
     before, now = len(gap), time.time_ns()
     os.kill(processes.pid("uncertainty_node"), signal.SIGCONT)
     client.spin(0.3)
-    backlog = [e for e in gap[before:] if e.track_id and now - stamp_of(e) > 0.6e9]
+    backlog = [e for e in gap[before:] if e.track_id and now - stamp_of(e) > 1.0e9]
     assert backlog
     assert GapEstimate.STATUS_VALID not in {e.status for e in backlog}
     # What comes then is fresh, and measured.
