@@ -224,7 +224,8 @@ def _note_truths(recording: Recording, outputs: Any, truths: dict[int, float]) -
 
 def estimated(outcome: Outcome, file: ParametersFile) -> tuple[list[GapEstimate], Counter[str]]:
     """The estimates from what an estimator was called with, and what it counted."""
-    estimator, found = GapEstimator(*file.build("uncertainty_node", PARAMETERS["uncertainty_node"])), []
+    estimator = GapEstimator(*file.build("uncertainty_node", PARAMETERS["uncertainty_node"]))
+    found: list[GapEstimate] = []
     for name, arguments in outcome.calls:
         # Without advice, which takes most of the time.
         given = (*arguments, 0) if name == "advance" else arguments

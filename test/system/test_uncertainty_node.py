@@ -17,15 +17,23 @@ from live import Client
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE
 
 DOMAIN = 51
 POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
 TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
 FRAME = 1 / 60
+# The views here are exact, and so is the scope.
+EXACT = [part for name in EXACT_SCOPE for part in ("-p", f"{name}:=0.0")]
+COMMAND = [
+    executable("knee_gap_uncertainty", "uncertainty_node"),
+    *("--ros-args", "-r", "__ns:=/knee_gap", *EXACT),
+]
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -53,20 +61,29 @@ def pose_message(stamp_ns: int, x: float) -> PoseWithCovarianceStamped:
     return message
 
 
+def stamp_of(message: GapEstimate) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
 class Track:
     """Feeds a scope that travels 6 mm in a second, and then stands still."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, behind: float = 0.0) -> None:
+        """`behind` [s]: how far its stamps are behind the clock."""
         self.client = client
         self.frame = 0
-        self.begin_ns = time.time_ns()
+        self._behind_ns = round(behind * 1e9)
+
+    def now_ns(self) -> int:
+        """Stamp of an image that is exposed now: a busy machine must not make the stamps fall behind."""
+        return time.time_ns() - self._behind_ns
 
     def run(self, frames: int, *, poses: bool = True, edges: bool = True) -> None:
         for _ in range(frames):
             started = time.monotonic()
             # At rest as well a tracker's numbers change in their last digits.
             x = min(self.frame * 1e-4, 0.006) + 1e-9 * self.frame
-            stamp = self.begin_ns + round(self.frame * FRAME * 1e9)
+            stamp = self.now_ns()
             if poses:
                 self.client.publish("scope_pose", pose_message(stamp - 1_000_000, x))
                 self.client.publish("scope_pose", pose_message(stamp + 1_000_000, x))
@@ -80,8 +97,7 @@ class Track:
 def processes(tmp_path: Path) -> Iterator[Processes]:
     environment = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with Processes(tmp_path, environment) as started:
-        command = [executable("knee_gap_uncertainty", "uncertainty_node")]
-        started.start("uncertainty_node", [*command, "--ros-args", "-r", "__ns:=/knee_gap"])
+        started.start("uncertainty_node", COMMAND)
         started.wait_ready(["uncertainty_node"], 120.0)
         yield started
 
@@ -102,7 +118,7 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     gap = client.received["gap"]
     track = Track(client)
     track.run(70)
-    client.spin_until(lambda: len(gap) >= 70)
+    client.spin_until(lambda: len([e for e in gap if e.track_id]) >= 70)
     good = [e for e in gap if e.status == GapEstimate.STATUS_VALID]
     assert len(good) > 40
     last = good[-1]
@@ -114,8 +130,8 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     # The tracker goes: the first image without a pose already says so, and carries no number.
     before, numbers = len(gap), len(client.received["gap/min"])
     track.run(6, edges=True, poses=False)
-    client.spin_until(lambda: len(gap) >= before + 6)
-    lost = gap[before : before + 6]
+    client.spin_until(lambda: len([e for e in gap[before:] if e.track_id]) >= 6)
+    lost = [e for e in gap[before:] if e.track_id][:6]
     assert {e.status for e in lost} == {GapEstimate.STATUS_TRACKING_LOST}
     assert all(math.isnan(value) for e in lost for value in (e.gap, e.gap_min, e.gap_max, e.snr))
     assert len(client.received["gap/min"]) == numbers
@@ -134,11 +150,72 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     assert all(math.isnan(e.gap) for e in silence)
 
 
+def test_says_that_nothing_came_yet_from_its_start(client: Client) -> None:
+    gap = client.received["gap"]
+    client.spin(0.5)
+    assert len(gap) >= 4
+    assert {e.status for e in gap} == {GapEstimate.STATUS_UNKNOWN}
+
+
+@pytest.mark.parametrize("behind", [3600.0, -3600.0])
+def test_stamps_an_hour_from_the_clock_are_out_of_sync(client: Client, behind: float) -> None:
+    gap = client.received["gap"]
+    Track(client, behind).run(70)
+    client.spin(0.2)
+    answers = [e for e in gap if e.track_id]
+    assert len(answers) > 60
+    assert {e.status for e in answers} == {GapEstimate.STATUS_OUT_OF_SYNC}
+
+
+def test_node_that_was_stopped_gives_no_old_number(client: Client, processes: Processes) -> None:
+    gap = client.received["gap"]
+    track = Track(client)
+    track.run(70)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
+    os.kill(processes.pid("uncertainty_node"), signal.SIGSTOP)
+    track.run(120)
+    before, now = len(gap), time.time_ns()
+    os.kill(processes.pid("uncertainty_node"), signal.SIGCONT)
+    client.spin(0.3)
+    backlog = [e for e in gap[before:] if e.track_id and now - stamp_of(e) > 1.0e9]
+    assert backlog
+    assert GapEstimate.STATUS_VALID not in {e.status for e in backlog}
+    # What comes then is fresh, and measured.
+    before = len(gap)
+    track.run(20)
+    client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
+
+
+def test_silence_is_said_when_the_clock_stops_with_the_images(tmp_path: Path) -> None:
+    """By a bag's clock no time passes then; the last word must not stay VALID."""
+    environment = {"ROS_DOMAIN_ID": str(DOMAIN + 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with Processes(tmp_path, environment) as started, Client(DOMAIN + 100) as client:
+        started.start("uncertainty_node", [*COMMAND, "-p", "use_sim_time:=true"])
+        started.wait_ready(["uncertainty_node"], 120.0)
+        client.offer(Clock, "/clock")
+        client.offer(GapEdges, "gap_edges")
+        client.offer(PoseWithCovarianceStamped, "scope_pose")
+        client.listen(GapEstimate, "gap")
+        client.wait_matched()
+        gap, track = client.received["gap"], Track(client, behind=1e8)
+        for _ in range(70):
+            clock = Clock()
+            clock.clock.sec, clock.clock.nanosec = divmod(track.now_ns(), 10**9)
+            client.publish("/clock", clock)
+            track.run(1)
+        client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap))
+        before = len(gap)
+        client.spin_until(
+            lambda: len([e for e in gap[before:] if e.status == GapEstimate.STATUS_NO_EDGES]) >= 4
+        )
+        assert gap[-1].status != GapEstimate.STATUS_VALID
+
+
 def test_rubbish_is_survived(client: Client, processes: Processes) -> None:
     track = Track(client)
     track.run(30)
     gap = client.received["gap"]
-    stamp = track.begin_ns + round(track.frame * FRAME * 1e9)
+    stamp = track.now_ns()
     broken = edges_message(stamp, 0.003)
     broken.bearing_0.x = math.nan
     client.publish("gap_edges", broken)
@@ -152,7 +229,7 @@ def test_rubbish_is_survived(client: Client, processes: Processes) -> None:
     processes.check("uncertainty_node")
     assert all(e.status != GapEstimate.STATUS_VALID for e in gap[-3:])
     # Time that ran backwards begins a new track, which measures as the first did.
-    again = Track(client)
+    again = Track(client, behind=5.0)
     before = len(gap)
     again.run(70)
     client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))

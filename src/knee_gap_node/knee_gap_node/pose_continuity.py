@@ -21,7 +21,7 @@ import numpy.typing as npt
 Vector = tuple[float, float, float]
 
 ACCELERATION = 2.0  # [m/s^2] four times the RMS of a hand's
-ANGULAR_ACCELERATION = 8.0  # [rad/s^2] the same for its rotation
+ANGULAR_ACCELERATION = 40.0  # [rad/s^2] of a tremor of a degree at 6 Hz
 TOLERANCE = 0.2e-3  # [m] beyond the poses' own errors
 ANGULAR_TOLERANCE = 2.0e-3  # [rad]
 MOST_UNKNOWN = 1.0e-3  # [m] by which acceleration may explain a deviation, however long the gap

@@ -92,9 +92,10 @@ class Kept(Enum):
 class Facts:
     """What is known of one image; the defaults are of what is not known yet.
 
-    `fault`: what raised an exception, in words. `is_silent`: no image came for too long, or none at all so far (`is_first_awaited`). `clock_offset` [s] is
-    how far the node's clock is ahead of the image's stamp, NaN where stamps are not held to a clock, and
-    `delay` [s] how much longer than it has to the answer takes. `pose` and `turn` are those at the image, or
+    `fault`: what raised an exception, in words. `is_silent`: no image came for too long, or none at all so
+    far (`is_first_awaited`). `clock_offset` [s] is how far the node's clock is ahead of the image's stamp,
+    NaN where stamps are not held to a clock, and `delay` [s] how much longer than it has to the answer
+    takes. `pose` and `turn` are those at the image, or
     why there is none. `needs_motion`: the clock has an error. `measured` is the estimate as it would be
     VALID, `section_flaw` why the edges at its section cannot be used, `at_border` that one of them lies at
     the border of the picture, `still_count` the images found still, `distance` [m] that of the farther point

@@ -1,13 +1,13 @@
 """Settings of the estimator, each with its meaning and the values it takes."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from knee_gap_node.parameter_rules import broken_rule
 from knee_gap_uncertainty.errors import MeasurementError
 
 # Of a scope that is known exactly, as a simulated one is: nothing of it is uncalibrated.
-EXACT_SCOPE = dict.fromkeys(
+EXACT_SCOPE: dict[str, Any] = dict.fromkeys(
     ("clock_error", "lens_position_error", "lens_rotation_error", "camera_error"), 0.0
 )
 
@@ -140,8 +140,8 @@ class EstimatorParameters:
     tracker_drift: float = field(
         default=0.05e-3,
         metadata={
-            "description": "RMS rate at which the tracked body creeps on the scope, felt at the lens: "
-            "markers on a clamp that its cable pulls, three millimetres a minute [m/s]",
+            "description": "RMS rate at which the tracked body creeps on the scope, at the lens: markers "
+            "on a clamp that its cable pulls, three millimetres a minute [m/s]",
             "range": (0.0, 0.01),
         },
     )

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.depth_drift import widened
+from knee_gap_uncertainty.errors import UnboundedError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.multi_view import MultiViewFit
 from knee_gap_uncertainty.posed_view import PosedView
@@ -124,7 +125,10 @@ class CalibrationError:
     angular_drift: float = 0.0
 
     def widened(self, fit: MultiViewFit, views: Views) -> MultiViewFit:
-        """The fit with the shared error in its covariances and in the common part of its shares."""
+        """The fit with the shared error in its covariances and in the common part of its shares.
+
+        Raises UnboundedError if the rays to a point are parallel.
+        """
         if not np.isfinite(fit.points).all() or views.lens_rotations is None:
             return fit
         shift = self._moved_points(fit, views)
@@ -196,7 +200,10 @@ class CalibrationError:
             aside[:, :, camera] += length[:, None, None] * by_camera[used, n]
             normal = np.einsum("i,ijk->jk", weight, across)
             right = np.einsum("i,ijk,ikl->jl", weight, across, aside)
-            moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
+            try:
+                moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
+            except np.linalg.LinAlgError:
+                raise UnboundedError("the rays to a point are parallel, and no depth is known") from None
         return moved
 
 

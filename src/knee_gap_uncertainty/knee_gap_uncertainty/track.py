@@ -134,8 +134,8 @@ class Track:
         fitted = with_depth_drift(
             fitted, views, self._first.lens, parameters.depth_drift, parameters.lasting_share
         )
-        fitted = self._calibration.widened(fitted, views)
         try:
+            fitted = self._calibration.widened(fitted, views)
             interval = confidence_interval(fitted, self._parameters.confidence_level)
             all_views = AllViews(views, fitted, interval)
             section = self._section.at(edges, view, _nearest(fitted.points, view.lens))

@@ -45,7 +45,7 @@ class UncertaintyNode(BaseNode):
         }
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
         self._profile = self.create_publisher(GapProfile, "gap_profile", RESULT_QOS)
-        self._clock = ContinuedClock()
+        self._continued_clock = ContinuedClock()
         # Said before the first image comes, so that a deadline can fire from now on.
         self.publish(self._estimator.begin(self.now_ns()))
         # Compiled before the first image, so that its estimate is not late.
@@ -113,7 +113,7 @@ class UncertaintyNode(BaseNode):
 
         It goes on when /clock has stopped: whoever waits for an image or a pose then would wait for ever.
         """
-        return self._clock.read(int(self.get_clock().now().nanoseconds), time.monotonic_ns())
+        return self._continued_clock.read(int(self.get_clock().now().nanoseconds), time.monotonic_ns())
 
     def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
         """Publish each estimate; the plain numbers only where they are valid."""

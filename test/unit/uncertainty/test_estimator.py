@@ -84,7 +84,8 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
 
 
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
-    estimate = run(GapEstimator(EXACT), list(np.linspace(0.0, 0.005, 11)))[-1]
+    parameters = replace(EXACT, tracker_drift=0.0, tracker_angular_drift=0.0)
+    estimate = run(GapEstimator(parameters), list(np.linspace(0.0, 0.005, 11)))[-1]
     first, now = edges(0, 0.0), edges(0, 0.005)
     expected = gap_range(
         [0, 0, 0],
@@ -354,3 +355,27 @@ def test_gap_beyond_any_joint_is_no_number() -> None:
     )
     assert not [e for e in estimates if e.status is GapStatus.VALID]
     assert estimates[-1].status is GapStatus.UNKNOWN
+
+
+@pytest.mark.parametrize("unseen", [0.5, 3.0])
+def test_a_scope_that_comes_back_elsewhere_begins_a_new_track(unseen: float) -> None:
+    """A body that slipped by 30 mm while nobody saw it: the views before are of another frame."""
+    estimator = GapEstimator(EXACT)
+    assert run(estimator, TRAVEL)[-1].status is GapStatus.VALID
+    begin = 10**9 + len(TRAVEL) * FRAME_NS + round(unseen * 1e9)
+    back = []
+    for k in range(20):
+        stamp, x = begin + k * FRAME_NS, 0.006 - 1e-4 * k
+        estimator.add_pose(pose(stamp - MS, x + 0.03), stamp)
+        back += estimator.add_edges(edges(stamp, x), stamp)
+        back += estimator.add_pose(pose(stamp + MS, x + 0.03), stamp)
+    assert not [one for one in back if one.status is GapStatus.VALID and abs(one.gap - TRUE_GAP) > 1e-4]
+    assert max(one.baseline for one in back if math.isfinite(one.baseline)) < 0.003
+    assert sum(n for key, n in estimator.counts.items() if key.startswith("tracks ended")) == 1
+
+
+def test_a_scope_that_comes_back_where_it_was_goes_on() -> None:
+    estimator = GapEstimator(EXACT)
+    run(estimator, TRAVEL)
+    begin = 10**9 + len(TRAVEL) * FRAME_NS + 500_000_000
+    assert run(estimator, [0.006 + 1e-9 * k for k in range(5)], begin=begin)[-1].status is GapStatus.VALID

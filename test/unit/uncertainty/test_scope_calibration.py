@@ -9,10 +9,15 @@ from travelling_scope import NOTHING, Array, camera_errors, estimates, scope, sp
 
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
+from knee_gap_uncertainty.scope_calibration import (
+    CalibrationError,
+    ScopeCalibration,
+    contradiction,
+    shared_error,
+)
 from knee_gap_uncertainty.views import bearing_covariances
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
@@ -71,18 +76,80 @@ def test_a_calibrations_error_that_is_none_leaves_nothing_valid(covariance: Arra
     assert found[-1].reason == wrong.flaw()
 
 
-@pytest.mark.parametrize("clock", [np.nan, 0.0])
-def test_not_used_is_no_flaw(clock: float) -> None:
-    nothing = ScopeCalibration("tracking_node", "a" * 64, np.full((6, 6), np.nan), clock)
+def test_what_was_not_calibrated_has_the_errors_that_the_parameters_state() -> None:
+    """Uncalibrated is wide, not silent: nothing is taken for exact because nobody said how wrong it is."""
+    limits = EstimatorParameters()
+    nothing = ScopeCalibration("tracking_node", "a" * 64, np.full((6, 6), np.nan), np.nan)
     assert not nothing.flaw()
-    assert nothing.error is None
     lens = replace(nothing, lens_covariance=GOOD)
-    assert not lens.flaw()
-    assert lens.error is not None
-    assert lens.error.clock == 0.0
-    clock_only = replace(nothing, time_offset_error=1e-3)
-    assert clock_only.error is not None
-    assert clock_only.error.clock == 1e-3
+    clock = replace(nothing, time_offset_error=1e-3)
+    without_hash = replace(clock, hash="", lens_covariance=GOOD)
+    for told_ones in ([], [nothing], [without_hash], [replace(clock, lens_covariance=-GOOD)]):
+        error = shared_error(told_ones, limits)
+        assert error.clock == limits.clock_error
+        assert np.trace(error.covariance[:3, :3]) == pytest.approx(limits.lens_position_error**2)
+        assert np.trace(error.covariance[3:, 3:]) == pytest.approx(limits.lens_rotation_error**2)
+    assert shared_error([], limits).camera == shared_error([without_hash], limits).camera > 0.0
+    assert shared_error([nothing], limits).camera == 0.0
+    assert shared_error([nothing, lens], limits).covariance is GOOD
+    assert shared_error([lens], limits).clock == limits.clock_error
+    assert shared_error([nothing, clock], limits).clock == 1e-3
+
+
+@pytest.mark.parametrize("name", list(EXACT_SCOPE))
+def test_both_intervals_include_what_was_not_calibrated(name: str) -> None:
+    exact = moving(EXACT)
+    # A share of it: the whole leaves nothing valid of so short a track.
+    wide = moving(replace(EXACT, **{name: 0.2 * getattr(EstimatorParameters(), name)}))
+    assert exact.status is wide.status is GapStatus.VALID
+    assert wide.gap == pytest.approx(exact.gap)
+    for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
+        assert getattr(wide, low) < getattr(exact, low)
+        assert getattr(wide, high) > getattr(exact, high)
+
+
+def moving(parameters: EstimatorParameters) -> GapEstimate:
+    """The last estimate of an uncalibrated scope that travels and turns, and states nothing of its camera."""
+    return estimates(parameters=parameters, camera=None)[-1]
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_drift_is_what_a_refit_with_a_creeping_body_shows(axis: int) -> None:
+    views = scope(20)
+    views = replace(views, times=np.linspace(0.0, 2.0, 20))
+    rates = np.zeros(6)
+    rates[axis] = [1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3][axis]
+    assert views.lens_rotations is not None
+    assert views.times is not None
+    crept = np.einsum("nij,j->ni", views.lens_rotations, rates[:3]) * views.times[:, None]
+    turn = np.einsum("nij,j->ni", views.lens_rotations, rates[3:]) * views.times[:, None]
+    gaps = []
+    for sign in (1.0, -1.0):
+        turned = Rotation.from_rotvec(sign * turn).as_matrix()
+        bearings = np.einsum("nij,nkj->nki", turned, views.bearings)
+        gaps.append(
+            fit(replace(views, bearings=bearings, lens_positions=views.lens_positions + sign * crept)).gap
+        )
+    shown = abs(gaps[0] - gaps[1]) / 2.0
+    fitted = fit(views)
+    error = CalibrationError(NOTHING, 0.0, drift=np.sqrt(3) * 1e-4 if axis < 3 else 0.0)
+    if axis >= 3:
+        error = replace(error, angular_drift=np.sqrt(3) * 1e-3)
+    told_variance = error.widened(fitted, views).gap_deviation ** 2 - fitted.gap_deviation**2
+    # All three axes are admitted, and this is one of them.
+    assert told_variance > (0.8 * shown) ** 2
+
+
+def test_drift_grows_with_the_time_between_the_views_and_does_not_average_out() -> None:
+    error = CalibrationError(NOTHING, 0.0, drift=1e-4)
+    spreads = []
+    for count, seconds in ((20, 1.0), (20, 2.0), (200, 2.0)):
+        views = replace(scope(count), times=np.linspace(0.0, seconds, count))
+        fitted = fit(views)
+        wider = error.widened(fitted, views)
+        spreads.append(np.sqrt(wider.gap_deviation**2 - fitted.gap_deviation**2))
+    assert spreads[1] == pytest.approx(2.0 * spreads[0], rel=1e-3)
+    assert spreads[2] > 0.8 * spreads[1]
 
 
 def test_a_covariance_that_was_rounded_in_a_file_is_one() -> None:

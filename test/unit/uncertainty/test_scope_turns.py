@@ -123,7 +123,7 @@ def turned_estimates(
     turn_at: Callable[[int], float | None], *, followed: bool = False, late: bool = False, shift: int = 0
 ) -> tuple[list[GapEstimate], GapEstimator]:
     """What the estimator says of 40 views, a turn told with each where `turn_at` has one; `late`: last."""
-    estimator, views, found = GapEstimator(EXACT), scope(40, 0.0), []
+    estimator, views, found = GapEstimator(replace(EXACT, least_baseline_share=0.0)), scope(40, 0.0), []
     estimator.add_calibration(replace(told("tracking_node", "a" * 64, error=SHIFT), turn_followed=followed))
     for k in range(40):
         stamp_ns = 10**18 + k * 10_000_000

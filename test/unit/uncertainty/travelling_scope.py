@@ -102,14 +102,18 @@ def observed(
 
 
 def estimates(
-    *calibrations: ScopeCalibration, camera: float = 0.0, turning: float = 0.3, scope_turn: float = 0.0
+    *calibrations: ScopeCalibration,
+    camera: float | None = 0.0,
+    turning: float = 0.3,
+    scope_turn: float = 0.0,
+    parameters: EstimatorParameters = EXACT,
 ) -> list[GapEstimate]:
     """What the estimator says of 40 views of the travelling scope, `camera` times its errors told.
 
-    It turns in its camera head by `scope_turn` [rad] on the way.
+    None tells no error of the camera. It turns in its camera head by `scope_turn` [rad] on the way.
     """
-    estimator, views, found = GapEstimator(EXACT), scope(40, turning), []
-    errors = camera * camera_errors(views, 0, 1, 2)
+    estimator, views, found = GapEstimator(parameters), scope(40, turning), []
+    errors = np.zeros((40, 2, 3, 0)) if camera is None else camera * camera_errors(views, 0, 1, 2)
     for calibration in calibrations:
         estimator.add_calibration(calibration)
     for k in range(40):
@@ -119,4 +123,25 @@ def estimates(
             found += estimator.add_turn(ScopeTurn(stamp_ns, scope_turn * k / 39), stamp_ns)
         estimator.add_pose(pose, stamp_ns)
         found += estimator.add_edges(edges, stamp_ns)
+    return found
+
+
+# Errors far below any tracker's: only the rules stand between a short travel and VALID.
+TINY = EstimatorParameters(**EXACT_SCOPE, tracker_drift=0.0, tracker_angular_drift=0.0)
+
+
+def travelling(
+    estimator: GapEstimator, depth: float, travel: float, count: int = 40, sigma: float = 1e-5
+) -> list[GapEstimate]:
+    """Images from a lens that travels past two points, 4 mm apart at a depth [m]."""
+    points, found = np.array([[0.0, -0.002, depth], [0.0, 0.002, depth]]), []
+    for k, x in enumerate(np.linspace(0.0, travel, count)):
+        stamp = 10**9 + k * 16_666_667
+        place = np.array([x + 1e-10 * k, 0.0, 0.0])
+        pose = LensPose(stamp, "world", place, Rotation.identity().as_quat(), np.diag([1e-16] * 6))
+        bearings = points - place
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        edges = EdgeObservation(stamp, 1, True, bearings, bearing_covariances(bearings, sigma), 3.0 * sigma)
+        estimator.add_pose(pose, stamp)
+        found += estimator.add_edges(edges, stamp)
     return found
