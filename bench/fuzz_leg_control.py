@@ -59,7 +59,9 @@ class Fuzz:
         self.old: list[Message] = []
         self.heard: dict[int, float] = {}
         # What the rule remembers: the greatest stamp, the messages by stamp, whether a person must come.
-        self.greatest_ns, self.of_image_ns, self.stated, self.latched = -1, -1, {}, False
+        self.greatest_ns = self.of_image_ns = -1
+        self.stated: dict[int, Estimate] = {}
+        self.latched = False
         self.acceptable: Message | None = None
         self.kinds: list[Callable[[Message], Message]] = [
             lambda m: m._replace(estimate=m.estimate._replace(gap=math.nan)),
@@ -202,7 +204,7 @@ class Fuzz:
             assert not self.latched, (command, message)
             assert self.acceptable is not None, (command, message)
             assert 0.0 <= command.opening_rate <= PARAMETERS.opening_rate
-        if command.opening_rate > 0.0:
+        if command.opening_rate > 0.0 and self.acceptable is not None:
             assert self.acceptable.estimate.gap_max < PARAMETERS.largest_gap
             assert self.acceptable.estimate.gap_min < PARAMETERS.instrument_diameter
         if command.action is Action.PASS:
