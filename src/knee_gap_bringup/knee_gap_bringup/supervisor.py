@@ -83,16 +83,18 @@ class _Supervisor:
         return self.end() or self._stopped_code
 
     def end(self) -> int:
-        """End what runs, the last that was started first; return the code of what failed to end well."""
-        code = 0
-        for index, process in reversed(list(self._running.items())):
+        """End what runs, all at once; return the code of what failed to end well."""
+        code, began = 0, time.monotonic()
+        for process in self._running.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
+        for index, process in self._running.items():
             try:
-                ended = process.wait(GRACE)
+                ended = process.wait(max(GRACE - (time.monotonic() - began), 0.1))
             except subprocess.TimeoutExpired:
                 process.kill()
                 ended = process.wait()
+                self._tell(f"{self._plan[index].executable} did not end within {GRACE:g} s and was killed")
             answer = reaction(self._plan[index], ended, ending=True)
             if answer.code:
                 self._tell(answer.words)

@@ -40,6 +40,7 @@ def run_main(module: str, *, node: bool = False) -> int:
     except KeyboardInterrupt:
         return 0 if node else 128 + signal.SIGINT
     finally:
-        # What is left is the end of the interpreter, which a signal would fill with tracebacks.
+        # All is closed. What is left is the end of the interpreter, which an exception would fill with
+        # tracebacks, and which must be ended from outside if it hangs.
         for number in STOPS:
-            signal.signal(number, signal.SIG_IGN)
+            signal.signal(number, signal.SIG_DFL)
