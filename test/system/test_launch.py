@@ -99,6 +99,11 @@ def catches(pid: int, number: int) -> bool:
     return bool(int(re.findall(r"SigCgt:\s*(\w+)", status)[0], 16) >> (number - 1) & 1)
 
 
+def is_python(pid: int) -> bool:
+    """Whether a process has become Python, however young."""
+    return b"python" in Path(f"/proc/{pid}/cmdline").read_bytes().partition(b"\0")[0]
+
+
 @pytest.mark.parametrize("name", [*EXECUTABLES, *COMMANDS])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_an_executable_imports_prints_nothing(name: str, number: int) -> None:
@@ -114,6 +119,22 @@ def test_a_signal_while_an_executable_imports_prints_nothing(name: str, number: 
     output, errors = process.communicate(timeout=60)
     assert (output, errors) == ("", "")
     assert process.returncode == (0 if node else 128 + number)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.2, 0.6])
+def test_started_by_tools_run_it_does_so_before_python_is_up_as_well(delay: float) -> None:
+    command = [str(ROOT / "tools" / "run"), "knee_gap_perception", "segmentation_node"]
+    process = subprocess.Popen(
+        command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    # bash itself, which sets the environment, ends by the signal without a word.
+    while process.poll() is None and not is_python(process.pid):
+        time.sleep(0.001)
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert "Traceback" not in output + errors
+    assert process.returncode == 0
 
 
 class Live:

@@ -6,10 +6,20 @@ launch is imported where it is used: this module can be read where launch is not
 import atexit
 import logging
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 
 from knee_gap_bringup.launch_plan import DRAIN, RESPAWN_DELAY, Next, PlannedProcess, Role, reaction
+
+# A signal that reaches a node before it can handle one waits, until its entry point lets it through.
+SIGNALS_WAIT = ("env", "--block-signal=INT", "--block-signal=TERM")
+
+
+def prefix() -> str:
+    """What stands before a node's command: `SIGNALS_WAIT` where this machine's `env` knows how."""
+    can = subprocess.run([*SIGNALS_WAIT, "true"], capture_output=True, check=False).returncode == 0
+    return " ".join(SIGNALS_WAIT) if can else ""
 
 
 def refuse(problem: str) -> None:
@@ -43,6 +53,8 @@ def _node(process: PlannedProcess, respawn_delay: float) -> object:
         parameters=[*process.parameters] if is_node else None,
         arguments=[*process.arguments],
         output="screen",
+        prefix=prefix(),
+        exec_name=process.executable,
         respawn=process.respawn,
         respawn_delay=respawn_delay,
     )

@@ -1,6 +1,7 @@
 """An executable that is stopped while it imports ends in silence."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 SOURCES = str(Path(__file__).parents[3] / "src" / "knee_gap_node")
+SETUPS = sorted(Path(SOURCES).parent.glob("*/setup.py"))
 # A module that takes long to import, and swallows what is raised meanwhile as some foreign ones do.
 SLOW = """
 import sys, time
@@ -96,3 +98,20 @@ def test_an_import_that_fails_is_still_loud(tmp_path):
     _, errors = process.communicate(timeout=20)
     assert "no such thing" in errors
     assert process.returncode == 1
+
+
+@pytest.mark.parametrize("setup", SETUPS, ids=lambda path: path.parent.name)
+def test_every_executable_starts_this_way(setup):
+    # Otherwise tools/run and the launch files, which block signals until an entry point lets them through,
+    # would start something that no Ctrl-C ends.
+    package = setup.parent.name
+    text = re.findall(r'"console_scripts": \[(.*?)\]', setup.read_text(), re.DOTALL)
+    scripts = re.findall(r'"(\w+) = ([\w.]+):(\w+)"', text[0])
+    assert len(scripts) == text[0].count('"') / 2
+    entries = setup.parent / package / "entry_points.py"
+    for name, module, function in scripts:
+        assert (module, function) == (f"{package}.entry_points", name)
+        module = re.findall(rf'^{name} = entry\("([\w.]+)"', entries.read_text(), re.MULTILINE)
+        assert len(module) == 1
+        source = SETUPS[0].parent.parent / package / Path(*module[0].split(".")).with_suffix(".py")
+        assert "\ndef main(" in source.read_text()
