@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -238,6 +239,23 @@ def test_a_node_that_is_killed_comes_back_and_goes_on_with_new_tracks(params: st
             if process is not None and process.poll() is None:
                 process.send_signal(signal.SIGINT)
                 process.wait(60)
+
+
+@pytest.mark.skipif(shutil.which("ros2") is None, reason="ros2 launch is not installed here")
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["replay.launch.py", "bag:=nowhere"], 1, "bag: nowhere does not exist"),
+        (["replay.launch.py", f"bag:={SAMPLE}", f"out:={ROOT / 'bags'}"], 1, "exists already"),
+        (["replay.launch.py", f"bag:={ROOT / 'README.md'}"], 1, "play ended with exit code 1; all ends"),
+        (["live.launch.py"], 2, "tracking_node ended with exit code 2; all ends"),
+    ],
+)
+def test_ros2_launch_ends_with_the_code_of_what_failed(arguments: list[str], code: int, words: str) -> None:
+    done = run("ros2", "launch", "knee_gap_bringup", *arguments)
+    assert done.returncode == code
+    assert words in done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
 
 
 def test_without_respawn_the_end_of_a_node_ends_all_with_its_code(params: str, tmp_path: Path) -> None:
