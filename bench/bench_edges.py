@@ -30,7 +30,10 @@ from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapStatus
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -97,7 +100,7 @@ class GapCheck:
     """The estimator behind the edges, and the true distance of the points of every track."""
 
     def __init__(self) -> None:
-        self._estimator = GapEstimator()
+        self._estimator = GapEstimator(EXACT)
         self._truth: dict[int, float] = {}
 
     def begin(self, track_id: int, points: Array) -> None:
@@ -107,7 +110,9 @@ class GapCheck:
     def add(self, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
         """Hand an image's edges and pose to the estimator, as messages, and score what comes out."""
         posed = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), pose)
-        seen = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+        seen = fill_gap_edges(
+            blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
+        )
         now = edges.stamp_ns
         estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
         estimates += self._estimator.add_edges(messages.edges_from_message(seen), now)

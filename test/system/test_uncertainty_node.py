@@ -59,7 +59,7 @@ class Track:
     def __init__(self, client: Client) -> None:
         self.client = client
         self.frame = 0
-        self.begin_ns = 10**9 * 1_700_000_000
+        self.begin_ns = time.time_ns()
 
     def run(self, frames: int, *, poses: bool = True, edges: bool = True) -> None:
         for _ in range(frames):

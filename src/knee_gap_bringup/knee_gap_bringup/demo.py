@@ -13,6 +13,7 @@ from knee_gap_bringup.comparison import EDGES, GAP, compare
 from knee_gap_bringup.gap_plot import write_gap_plot
 from knee_gap_bringup.launch_plan import DRAIN, NODES
 from knee_gap_bringup.processes import Processes, StartError, executable
+from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_replay.bag import BagReader
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.errors import SimulationError
@@ -45,8 +46,7 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
             if rate != 1.0:
                 # Waiting is then measured by the bag's clock.
                 command += ["-p", "use_sim_time:=true"]
-            if node == "tracking_node":
-                command += ["--params-file", str(bag / PARAMETERS_FILE)]
+            command += scope_arguments(node, bag)
             if node == "segmentation_node":
                 command += ["-p", "image_transport:=compressed"]
                 if rate < 1.0:
@@ -73,6 +73,15 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
         if processes.end("record") != 0:
             print(f"demo: {processes.last_words('record')}", file=sys.stderr)
     return recording
+
+
+def scope_arguments(node: str, bag: Path) -> list[str]:
+    """What a node is given of the scope: the calibration beside the bag, or where its lens nominally sits."""
+    calibration = bag / CALIBRATION_FILE
+    if calibration.is_file():
+        # The same for the two nodes that use it; uncertainty_node is told by them.
+        return [] if node == "uncertainty_node" else ["-p", f"calibration_file:={calibration.resolve()}"]
+    return ["--params-file", str(bag / PARAMETERS_FILE)] if node == "tracking_node" else []
 
 
 def run(bag: Path, out: Path, rate: float) -> None:

@@ -30,8 +30,10 @@ OUTPUTS = (
     "gap/min",
     "gap/max",
     "gap/snr",
+    "gap_profile",
     "motion_advice",
 )
+CALIBRATION_FILE = "calibration.yaml"
 # Time for the last image to pass through the nodes [s].
 DRAIN = 1.0
 # Pause before a node that ended is started again [s].
@@ -106,14 +108,11 @@ def replay_plan(
     """The three nodes, a recorder of their output if `out` is given, and the player, whose end ends all."""
     space = absolute(namespace)
     inputs = [f"{space}/{topic}" for topic in INPUTS]
-    # A simulated bag carries the place of the lens on the tracked body beside it, for tracking_node alone.
-    beside = Path(bag) / "scope.yaml"
     given = (params,) if params else ()
     own: dict[str, tuple[str | Mapping[str, object], ...]] = {
-        "segmentation_node": (*given, {"image_transport": "compressed"}),
-        "tracking_node": given or ((str(beside),) if beside.is_file() else ()),
-        "uncertainty_node": given,
+        name: given or _beside(Path(bag), name) for name in NODES
     }
+    own["segmentation_node"] += ({"image_transport": "compressed"},)
     plan = [
         PlannedProcess(package, name, namespace=namespace, parameters=own[name])
         for name, package in NODES.items()
@@ -124,6 +123,15 @@ def replay_plan(
     play = (bag, "--rate", rate, "--topics", *inputs, "--wait-for", *inputs, "--delay", "1")
     plan.append(PlannedProcess("knee_gap_replay", "play", Role.PLAYER, play))
     return tuple(plan)
+
+
+def _beside(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
+    """What stands beside a simulated bag for a node: its calibration, or where its lens nominally sits."""
+    calibration, nominal = bag / CALIBRATION_FILE, bag / "scope.yaml"
+    if calibration.is_file():
+        # uncertainty_node is told by the two others.
+        return () if node == "uncertainty_node" else ({"calibration_file": str(calibration.resolve())},)
+    return (str(nominal),) if node == "tracking_node" and nominal.is_file() else ()
 
 
 def live_problem(params: str, respawn_delay: str = str(RESPAWN_DELAY)) -> str:

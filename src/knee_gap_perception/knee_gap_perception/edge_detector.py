@@ -8,13 +8,14 @@ import numpy.typing as npt
 
 from knee_gap_perception.camera import Camera, bearing_jacobian
 from knee_gap_perception.edge_parameters import EdgeParameters
-from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder
 from knee_gap_perception.gap_search import GapSearch, NoPointsError, check_light
 from knee_gap_perception.local_plane import View
 from knee_gap_perception.point_track import PointTrack, Sighting
 from knee_gap_perception.poses import LensPose
+from knee_gap_perception.section_edges import SectionEdgeFinder
 from knee_gap_perception.surface_points import choose_points
 
 Array = npt.NDArray[np.float64]
@@ -30,6 +31,7 @@ class _Track:
     kinds: tuple[EdgeKind, EdgeKind]
     pose_frame: str | None
     clicked: Array | None
+    edges: SectionEdgeFinder
 
 
 class GapEdgeDetector:
@@ -50,6 +52,7 @@ class GapEdgeDetector:
         self._track: _Track | None = None
         self._next_track_id = first_track_id
         self._seen_ns = 0
+        self._profile_ns: int | None = None
         self._stamp_ns: int | None = None
         self._image: Image | None = None
         self._thumbnail: Image | None = None
@@ -203,7 +206,32 @@ class GapEdgeDetector:
             sightings = self._follow(stamp_ns, grey, camera, view, field)
         edges = self._edges(stamp_ns, frame_id, camera, sightings)
         first, second = sightings
-        return replace(edges, hidden=(not first.seen, not second.seen), pose_used=view is not None)
+        section, sections = self._section_edges(stamp_ns, picture, grey, field, camera, edges.pixels)
+        return replace(
+            edges,
+            hidden=(not first.seen, not second.seen),
+            pose_used=view is not None,
+            section=section,
+            sections=sections,
+        )
+
+    def _section_edges(
+        self,
+        stamp_ns: int,
+        picture: Image,
+        grey: Image,
+        field: FieldOfView,
+        camera: Camera,
+        pixels: Array,
+    ) -> tuple[SectionEdges, tuple[SectionEdges, ...]]:
+        """The edges beside the points, and from time to time those at more sections along the opening."""
+        assert self._track is not None
+        since_ns = np.inf if self._profile_ns is None else abs(stamp_ns - self._profile_ns)
+        profile = bool(since_ns >= 1e9 * self.parameters.profile_period)
+        if profile:
+            self._profile_ns = stamp_ns
+        foreign, scale = self._search.foreign(picture)
+        return self._track.edges.find(stamp_ns, grey, foreign, scale, field, camera, pixels, profile=profile)
 
     def _settle_frame(self, pose_frame: str) -> None:
         """Let the track be begun anew where it cannot use poses in a frame.
@@ -243,6 +271,7 @@ class GapEdgeDetector:
             (points[0].kind, points[1].kind),
             self._pose_frame if view is not None else None,
             self._clicked,
+            SectionEdgeFinder(section.centre, section.across, np.stack([point.pixel for point in points])),
         )
         self._next_track_id += 1
         self._clicked = None

@@ -101,6 +101,13 @@ class EdgeParameters:
             "range": (0.0, 10.0),
         },
     )
+    profile_period: float = field(
+        default=0.2,
+        metadata={
+            "description": "Time between two looks at more sections along the opening [s]",
+            "range": (0.0, 60.0),
+        },
+    )
     frozen_images: int = field(
         default=3,
         metadata={

@@ -67,6 +67,11 @@ class GapSearch:
         full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
 
+    def foreign(self, picture: Image) -> tuple[Mask, float]:
+        """Instruments and glare (h, w) in a picture made smaller, and its scale against the full one."""
+        small, scale = self._smaller(picture)
+        return foreign_bodies(small), scale
+
     def agreed_section(
         self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None
     ) -> Found:

@@ -1,12 +1,13 @@
 """Messages to images and edges to messages, by field name: ROS's own classes and any other serve alike."""
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.edges import GapEdges
+from knee_gap_perception.edges import GapEdges, SectionEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.poses import LensPose
 
@@ -126,8 +127,11 @@ def lens_pose_from_message(message: Any) -> LensPose:
     )
 
 
-def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
-    """Set every field of a default-constructed knee_gap_msgs/GapEdges from edges; returns the message."""
+def fill_gap_edges(message: Any, edges: GapEdges, blank_section: Callable[[], Any]) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/GapEdges from edges; returns the message.
+
+    `blank_section` makes a default-constructed knee_gap_msgs/GapSection of the same kind.
+    """
     seconds, nanoseconds = divmod(edges.stamp_ns, 1_000_000_000)
     message.header.stamp.sec = seconds
     message.header.stamp.nanosec = nanoseconds
@@ -144,8 +148,22 @@ def fill_gap_edges(message: Any, edges: GapEdges) -> Any:
             message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
         )
         setattr(message, f"camera_error_{index}", _camera_error(edges.camera_errors[index]))
+        setattr(message, f"edge_state_{index}", int(edges.section.states[index]))
+        setattr(message, f"edge_pixel_{index}", np.array(edges.section.pixels[index], dtype=np.float64))
+        setattr(message, f"edge_deviation_{index}", float(edges.section.deviations[index]))
+    _fill_section(message, edges.section)
+    message.sections = [_fill_section(blank_section(), section) for section in edges.sections]
     message.pose_used = bool(edges.pose_used)
     message.angular_error = float(edges.angular_error)
+    return message
+
+
+def _fill_section(message: Any, section: SectionEdges) -> Any:
+    """Set the bearings of both edges and the bound of their errors."""
+    for index in (0, 1):
+        edge = getattr(message, f"edge_{index}")
+        edge.x, edge.y, edge.z = (float(value) for value in section.bearings[index])
+    message.edge_error = float(section.error)
     return message
 
 

@@ -10,7 +10,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
-from knee_gap_msgs.msg import GapEdges, ScopeCalibration, ScopeNotch
+from knee_gap_msgs.msg import GapEdges, GapSection, ScopeCalibration, ScopeNotch
 from knee_gap_msgs.srv import ChoosePoint
 from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_node.errors import ConfigurationError
@@ -89,7 +89,7 @@ class SegmentationNode(BaseNode):
         """Publish the edges in the images that wait no longer, and the pictures that anybody wants."""
         self.take_waiting_poses()
         for edges in self._stream.ready(self.now_ns()):
-            message = fill_gap_edges(GapEdges(), edges)
+            message = fill_gap_edges(GapEdges(), edges, GapSection)
             self._edges.publish(message)
             if self._stream.reason:
                 self.log_once(edges.status.name, f"{edges.status.name}: {self._stream.reason}")

@@ -38,7 +38,8 @@ from knee_gap_replay.qos import QosName
 from knee_gap_replay.topics import InputTopics
 from knee_gap_replay.types import blank
 from knee_gap_uncertainty import messages
-from knee_gap_uncertainty.estimator import NANOSECONDS, GapEstimator
+from knee_gap_uncertainty.delays import NANOSECONDS
+from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.motion_advice import AdviceParameters
@@ -148,6 +149,7 @@ class GapPipeline:
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
             self._topic("gap"): ("knee_gap_msgs/msg/GapEstimate", "reliable"),
+            self._topic("gap_profile"): ("knee_gap_msgs/msg/GapProfile", "reliable"),
             self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
             **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
         }
@@ -237,7 +239,9 @@ class GapPipeline:
 
     def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output]:
         for edges in images:
-            edges_message = fill_gap_edges(blank("knee_gap_msgs/msg/GapEdges"), edges)
+            edges_message = fill_gap_edges(
+                blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
+            )
             yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
             if self._with_mask and (mask := self._detector.mask()) is not None:
                 yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)
@@ -253,6 +257,11 @@ class GapPipeline:
                     number = blank("std_msgs/msg/Float64")
                     number.data = float(getattr(estimate, attribute))
                     yield Output(self._topic(name), number, estimate.stamp_ns)
+
+        while self._estimator.profiles:
+            profile = self._estimator.profiles.popleft()
+            message = messages.fill_gap_profile(blank("knee_gap_msgs/msg/GapProfile"), profile)
+            yield Output(self._topic("gap_profile"), message, profile.stamp_ns)
 
     def _advice(self) -> Iterator[Output]:
         while self._estimator.advice:

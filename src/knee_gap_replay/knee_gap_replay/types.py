@@ -19,6 +19,18 @@ from knee_gap_replay.errors import BagError
 
 _SOURCE_TREE = Path(__file__).resolve().parents[2]
 
+# A type stands behind those that it holds.
+OWN_TYPES = (
+    "GapSection",
+    "GapEdges",
+    "GapEstimate",
+    "GapProfile",
+    "MotionAdvice",
+    "ScopeCalibration",
+    "ScopeNotch",
+    "ScopeTurn",
+)
+
 _NUMPY_NAMES = {
     "float32",
     "float64",
@@ -44,7 +56,7 @@ def typestore() -> Typestore:
     Raises BagError where the definitions of knee_gap_msgs are not found.
     """
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name in ("GapEdges", "GapEstimate", "MotionAdvice", "ScopeCalibration", "ScopeNotch", "ScopeTurn"):
+    for name in OWN_TYPES:
         _register(store, f"knee_gap_msgs/msg/{name}")
     return store
 

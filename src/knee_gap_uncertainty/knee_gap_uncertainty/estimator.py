@@ -11,31 +11,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_uncertainty.acceptance import Facts, Verdict, judge
 from knee_gap_uncertainty.advice_task import PIECES, AdviceTask
+from knee_gap_uncertainty.delays import NANOSECONDS, DelayFloor
 from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.gap_profile import GapProfile
 from knee_gap_uncertainty.leg_body import LegBody
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
-from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
+from knee_gap_uncertainty.scope_calibration import ScopeCalibration, contradiction, shared_error
 from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns, TurnRefusal
 from knee_gap_uncertainty.track import Track
 
-NANOSECONDS = 1_000_000_000
-
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
-LEG_MOVED = "the leg body moved"
-UNKNOWN_MOTION = "the clock is uncertain, and no two lens poses near the image tell how fast the lens moved"
-NO_NUMBERS = "the views, or the calibration's error, cannot be calculated with"
-
-
-# A quarter of a second of a tracker: slow replay, whose stamps fall behind the clock, is no delay.
-POSES_OF_DELAY = 32
-LATE = "the image came too long after the lens poses of its time"
-
-# Advice that nobody has taken yet.
+# Of calibrations: what a network says must not grow without end.
+MOST_NODES = 8
+# Advice, and profiles, that nobody has taken yet.
 MOST_ADVICE = 16
 
 
@@ -49,7 +43,8 @@ class Pending(NamedTuple):
 class GapEstimator:
     """Fuses edges and lens poses into one estimate an image, in the order of the images.
 
-    Advice on motion is made while time passes; whoever wants it takes it from `advice`.
+    Advice on motion is made while time passes and is taken from `advice`; `profiles` are those of the images
+    that show more sections of the opening.
     """
 
     def __init__(
@@ -57,6 +52,7 @@ class GapEstimator:
     ) -> None:
         self.parameters = parameters or EstimatorParameters()
         self.advice: deque[MotionAdvice] = deque(maxlen=MOST_ADVICE)
+        self.profiles: deque[GapProfile] = deque(maxlen=MOST_ADVICE)
         self._advice_task = AdviceTask(advice)
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
@@ -71,10 +67,12 @@ class GapEstimator:
         self._leg_at_first: LensPose | None = None
         self.calibrations: dict[str, ScopeCalibration] = {}
         self.calibration_flaw = ""
-        self._calibration_error: CalibrationError | None = None
+        self._calibration_error = shared_error((), self.parameters)
         self._frame_id = ""
+        # Whether stamps are held to the clock of whoever feeds this: live they are of the same time.
+        self._is_live = False
         # By how much the clock was ahead of the stamps of the latest poses: what an image's delay is held to.
-        self._pose_delays_ns: deque[int] = deque(maxlen=POSES_OF_DELAY)
+        self._delays = DelayFloor()
         self._last_edges: Pending | None = None
         self._silence_told_ns = 0
         self._now_ns = 0
@@ -94,7 +92,9 @@ class GapEstimator:
             if pose.frame_id != self._frame_id:
                 self._turns.forget_before(pose.stamp_ns)
             self._frame_id = pose.frame_id
-            self._pose_delays_ns.append(arrival_ns - queued_ns - pose.stamp_ns)
+            delay_ns = arrival_ns - queued_ns - pose.stamp_ns
+            near = abs(delay_ns) <= self.parameters.max_clock_offset * NANOSECONDS
+            self._delays.take(delay_ns, arrival_ns, is_live=self._is_live and near)
         return self._resolve(arrival_ns)
 
     def add_turn(self, told: ScopeTurn, arrival_ns: int) -> list[GapEstimate]:
@@ -122,11 +122,14 @@ class GapEstimator:
         Where nodes contradict each other, or tell an error that is none, nothing is valid.
         """
         known = self.calibrations.get(told.node)
+        if known is None and len(self.calibrations) == MOST_NODES:
+            self.counts["calibrations of more nodes than there can be"] += 1
+            self.calibration_flaw = f"more than {MOST_NODES} nodes state a calibration of the scope"
+            return
         self.calibrations[told.node] = told
         flaws = [contradiction(self.calibrations), *(one.flaw() for one in self.calibrations.values())]
         self.calibration_flaw = next((flaw for flaw in flaws if flaw), "")
-        errors = [one.error for one in self.calibrations.values() if not one.flaw()]
-        self._calibration_error = next((error for error in errors if error is not None), None)
+        self._calibration_error = shared_error(self.calibrations.values(), self.parameters)
         if known is None or not told.says_the_same_as(known):
             # Views by another calibration are not comparable with those before.
             self._track = None
@@ -142,7 +145,7 @@ class GapEstimator:
         if last is not None and edges.stamp_ns < last.edges.stamp_ns:
             self.counts["stamps ran backwards"] += 1
             self._pending.clear()
-            self._pose_delays_ns.clear()
+            self._delays.clear()
             self._track = None
         self._last_edges = Pending(edges, arrival_ns)
         self._silence_told_ns = arrival_ns
@@ -161,23 +164,42 @@ class GapEstimator:
         if advice := self._advice_task.turn(self._situation(), advice_pieces):
             self.advice.append(advice)
         estimates = self._resolve(now_ns)
-        if self._last_edges is None or self._pending:
+        if self._pending or (self._last_edges is None and not self._is_live):
             return estimates
-        silence_ns = now_ns - self._silence_told_ns
-        if silence_ns > self.parameters.max_edges_silence * NANOSECONDS:
-            self._silence_told_ns = now_ns
-            last = self._last_edges
-            # The only stamp that is not an image's: no image came, and the statement needs a time.
-            stamp_ns = last.edges.stamp_ns + now_ns - last.arrival_ns
-            estimates.append(self._without(stamp_ns, GapStatus.NO_EDGES, 0, "no edges arrive"))
+        if now_ns - self._silence_told_ns > self.parameters.max_edges_silence * NANOSECONDS:
+            estimates.append(self._silence(now_ns))
         return estimates
+
+    def begin(self, now_ns: int) -> list[GapEstimate]:
+        """Begin to measure live: stamps are held to the clock, and silence is reported from now on."""
+        self._is_live = True
+        self._now_ns = now_ns
+        return [self._silence(now_ns)]
+
+    def leaving(self, estimate: GapEstimate, now_ns: int) -> GapEstimate:
+        """An estimate as it leaves at a time [ns]: without numbers if its image is too long ago by then."""
+        if estimate.status is not GapStatus.VALID:
+            return estimate
+        delay = self._delays.excess(now_ns - estimate.stamp_ns)
+        verdict = judge(Facts(self.parameters, delay=delay))
+        return self._without(estimate.stamp_ns, estimate.track_id, verdict) if verdict else estimate
+
+    def _silence(self, now_ns: int) -> GapEstimate:
+        """Statement that no image comes."""
+        self._silence_told_ns = now_ns
+        last = self._last_edges
+        # The only stamp that is not an image's: no image came, and the statement needs a time.
+        stamp_ns = now_ns if last is None else last.edges.stamp_ns + now_ns - last.arrival_ns
+        verdict = judge(Facts(self.parameters, is_silent=True, is_first_awaited=last is None))
+        assert verdict is not None
+        return self._without(max(stamp_ns, 0), 0, verdict)
 
     def _turn_clock(self, now_ns: int) -> None:
         """Take the time; where it runs backwards (a bag that starts again) nothing waits any longer."""
         if now_ns < self._now_ns:
             self.counts["clock ran backwards"] += 1
             self._pending.clear()
-            self._pose_delays_ns.clear()
+            self._delays.clear()
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
                 self._silence_told_ns = now_ns
@@ -197,61 +219,64 @@ class GapEstimator:
     def _try(self, pending: Pending, now_ns: int) -> GapEstimate | None:
         """Estimate of one image, or None while its lens pose, or the turn at it, may still come."""
         edges = pending.edges
-        if flaw := edges.flaw():
-            return self._without(edges.stamp_ns, GapStatus.NO_EDGES, edges.track_id, flaw)
+        facts = Facts(
+            self.parameters,
+            edges=edges,
+            edges_flaw=edges.flaw(),
+            clock_offset=1e-9 * (pending.arrival_ns - edges.stamp_ns) if self._is_live else np.nan,
+            delay=self._delays.excess(pending.arrival_ns - edges.stamp_ns),
+            pose=self._poses.at(edges.stamp_ns),
+            turn=self._turns.at(edges.stamp_ns) if self._turn_is_followed() else 0.0,
+        )
+        awaited = facts.pose is PoseRefusal.NOT_YET or facts.turn is TurnRefusal.NOT_YET
         may_wait = now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS
-        pose = self._poses.at(edges.stamp_ns)
-        if isinstance(pose, LensPose):
-            if self._is_late(pending):
-                return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, LATE)
-            turn = self._turns.at(edges.stamp_ns) if self._turn_is_followed() else 0.0
-            if not isinstance(turn, TurnRefusal):
-                return self._measure(edges, replace(pose, scope_turn=turn))
-            if turn is TurnRefusal.NOT_YET and may_wait:
-                return None
-            reason = TurnRefusal.NONE_NEAR.value
-            return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, reason)
-        if pose is PoseRefusal.NOT_YET:
-            if may_wait:
-                return None
-            return self._without(
-                edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, "no lens pose follows the image"
-            )
-        return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, pose.value)
+        if awaited and may_wait and not facts.edges_flaw:
+            return None
+        if verdict := judge(facts):
+            return self._without(edges.stamp_ns, edges.track_id, verdict)
+        assert isinstance(facts.pose, LensPose)
+        assert not isinstance(facts.turn, TurnRefusal)
+        return self._measure(facts, edges, replace(facts.pose, scope_turn=facts.turn))
 
     def _turn_is_followed(self) -> bool:
         """Whether somebody tells, or says that he will, how far the scope is turned in its camera head."""
         return self._turn_told or any(one.turn_followed for one in self.calibrations.values())
 
-    def _is_late(self, pending: Pending) -> bool:
-        """Whether an image came so long after the poses of its time that its answer is of the past."""
-        if not self._pose_delays_ns:
-            return False
-        delay_ns = pending.arrival_ns - pending.edges.stamp_ns - min(self._pose_delays_ns)
-        return delay_ns > self.parameters.max_delay * NANOSECONDS
-
-    def _measure(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
+    def _measure(self, facts: Facts, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Estimate from the edges and their lens pose, within the track that they belong to."""
         if self.calibration_flaw:
             self._track = None
-            return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, self.calibration_flaw)
-        if self._leg is not None and (flaw := self._leg.flaw(edges.stamp_ns, pose.frame_id)):
-            return self._without(edges.stamp_ns, GapStatus.TRACKING_LOST, edges.track_id, flaw)
-        error = self._calibration_error
-        if error is not None and error.clock > 0.0 and not np.isfinite(pose.motion).all():
-            return self._without(edges.stamp_ns, GapStatus.OUT_OF_SYNC, edges.track_id, UNKNOWN_MOTION)
-        begins = self._track is None or not self._track.continues_with(edges, pose)
-        if self._leg is not None and not begins and self._leg_moved(self._leg, pose):
+        if self._track is not None and self._track.breaks_at(pose):
             self._track = None
-            return self._without(edges.stamp_ns, GapStatus.JOINT_MOVED, edges.track_id, LEG_MOVED)
+            self.counts[f"tracks ended: {self._poses.discontinuity}"] += 1
+        begins = self._track is None or not self._track.continues_with(edges, pose)
+        facts = replace(
+            facts,
+            calibration_flaw=self.calibration_flaw,
+            leg_flaw=self._leg.flaw(edges.stamp_ns, pose.frame_id) if self._leg is not None else "",
+            needs_motion=self._calibration_error.clock > 0.0,
+        )
+        if self._leg is not None and not facts.leg_flaw and not begins:
+            facts = replace(facts, leg_moved=self._leg_moved(self._leg, pose))
+        if verdict := judge(facts):
+            if facts.leg_moved:
+                self._track = None
+            return self._without(edges.stamp_ns, edges.track_id, verdict)
         if self._track is None or begins:
             self._leg_at_first = self._leg.pose if self._leg is not None else None
-            self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
+            columns = edges.camera_errors.shape[-1]
+            self._track = Track(
+                edges.track_id, pose.frame_id, self.parameters, self._calibration_error, columns
+            )
         try:
             estimate = self._track.add(edges, pose)
-        except (MeasurementError, ArithmeticError, ValueError):
+        except (MeasurementError, ArithmeticError, ValueError) as error:
             self._track = None
-            return self._without(edges.stamp_ns, GapStatus.UNKNOWN, edges.track_id, NO_NUMBERS)
+            verdict = judge(Facts(self.parameters, error=error))
+            assert verdict is not None
+            return self._without(edges.stamp_ns, edges.track_id, verdict)
+        if self._track.profile is not None:
+            self.profiles.append(self._track.profile)
         travel_left = self._advice_task.travel_left(self._track.situation)
         return self._count(replace(estimate, translation_to_target=travel_left))
 
@@ -264,22 +289,22 @@ class GapEstimator:
         """What advice can be based on now."""
         return self._track.situation if self._track is not None else None
 
-    def _without(self, stamp_ns: int, status: GapStatus, track_id: int, reason: str) -> GapEstimate:
+    def _without(self, stamp_ns: int, track_id: int, verdict: Verdict) -> GapEstimate:
         """An estimate that says why there is no number."""
         return self._count(
             GapEstimate(
                 stamp_ns,
                 self._frame_id,
-                status,
+                verdict.status,
                 track_id=track_id,
                 interval=self.parameters.interval,
-                reason=reason,
+                rejection=verdict.rejection,
             )
         )
 
     def _count(self, estimate: GapEstimate) -> GapEstimate:
         self.latest = estimate
         self.counts[estimate.status.name] += 1
-        if estimate.reason:
-            self.counts[f"{estimate.status.name}: {estimate.reason}"] += 1
+        if estimate.rejection is not None:
+            self.counts[f"{estimate.status.name}: {estimate.rejection.reason.value}"] += 1
         return estimate

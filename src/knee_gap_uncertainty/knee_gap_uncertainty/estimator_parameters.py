@@ -6,6 +6,11 @@ from typing import Literal
 from knee_gap_node.parameter_rules import broken_rule
 from knee_gap_uncertainty.errors import MeasurementError
 
+# Of a scope that is known exactly, as a simulated one is: nothing of it is uncalibrated.
+EXACT_SCOPE = dict.fromkeys(
+    ("clock_error", "lens_position_error", "lens_rotation_error", "camera_error"), 0.0
+)
+
 
 @dataclass(frozen=True)
 class EstimatorParameters:
@@ -100,6 +105,81 @@ class EstimatorParameters:
         metadata={
             "description": "gap above which an estimate is taken for a mistake: no joint opens so far [m]",
             "range": (0.001, 1.0),
+        },
+    )
+    longest_unseen_edges: float = field(
+        default=0.7,
+        metadata={
+            "description": "how long the edges of the opening are carried on, with growing errors, while no "
+            "image shows them beside the points [s]",
+            "range": (0.0, 10.0),
+        },
+    )
+    least_baseline: float = field(
+        default=0.5e-3,
+        metadata={
+            "description": "how far the lens must be from the track's first view for a gap to be valid [m]",
+            "range": (0.0, 0.1),
+        },
+    )
+    least_baseline_share: float = field(
+        default=0.1,
+        metadata={
+            "description": "the same as a share of the distance of the farther point: 1 mm at 10 mm [-]",
+            "range": (0.0, 1.0),
+        },
+    )
+    max_clock_offset: float = field(
+        default=10.0,
+        metadata={
+            "description": "how far an image's stamp may be from this node's clock; beyond it an image is "
+            "out of sync, unless it is more than a day old and so of a recording [s]",
+            "range": (0.1, 1e6),
+        },
+    )
+    tracker_drift: float = field(
+        default=0.05e-3,
+        metadata={
+            "description": "RMS rate at which the tracked body creeps on the scope, felt at the lens: "
+            "markers on a clamp that its cable pulls, three millimetres a minute [m/s]",
+            "range": (0.0, 0.01),
+        },
+    )
+    tracker_angular_drift: float = field(
+        default=1e-4,
+        metadata={
+            "description": "RMS rate at which the tracked body turns on the scope: a third of a degree a "
+            "minute [rad/s]",
+            "range": (0.0, 0.1),
+        },
+    )
+    clock_error: float = field(
+        default=0.035,
+        metadata={
+            "description": "standard error of the offset between the clocks of images and tracker if it was "
+            "not calibrated: drivers stamp pictures up to a tenth of a second after exposure [s]",
+            "range": (0.0, 1.0),
+        },
+    )
+    lens_position_error: float = field(
+        default=2e-3,
+        metadata={
+            "description": "RMS error of the lens's position on the body if it was not calibrated [m]",
+            "range": (0.0, 0.1),
+        },
+    )
+    lens_rotation_error: float = field(
+        default=0.01,
+        metadata={
+            "description": "RMS error of the lens's rotation on the body if it was not calibrated [rad]",
+            "range": (0.0, 1.0),
+        },
+    )
+    camera_error: float = field(
+        default=0.02,
+        metadata={
+            "description": "relative standard error of the focal length if the camera was not calibrated [-]",
+            "range": (0.0, 0.5),
         },
     )
     leg_motion: float = field(

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from knee_gap_uncertainty.acceptance import Rejection
 
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
@@ -24,6 +28,28 @@ class GapStatus(IntEnum):
     JOINT_MOVED = 6
 
 
+class EdgeState(IntEnum):
+    """Whether an image shows an edge; the constants of knee_gap_msgs/GapEdges."""
+
+    UNKNOWN = 0
+    SEEN = 1
+    AT_BORDER = 2
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeSection:
+    """The two edges of the opening at one section of it, in the lens frame of one image.
+
+    `bearings` (2, 3) unit vectors; `deviations` (2,), the standard deviation of each across the opening
+    [rad]; `error` bounds the larger error [rad]. Numbers of an edge that is not seen are NaN.
+    """
+
+    states: tuple[int, int] = (EdgeState.UNKNOWN, EdgeState.UNKNOWN)
+    bearings: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
+    deviations: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(2, NAN))
+    error: float = NAN
+
+
 @dataclass(frozen=True, eq=False)
 class EdgeObservation:
     """The two points in one image.
@@ -35,7 +61,8 @@ class EdgeObservation:
     have been counted, and counting them again would make the fit too sure. `pose_used` says that the pose of
     the lens guided the search, so that bearings and pose share some of their errors. `camera_errors`
     (2, 3, k) are the displacements of the bearings by one standard deviation of each of the k errors of the
-    camera's own numbers [rad], which all images share.
+    camera's own numbers [rad], which all images share. `kinds` are the sender's codes of the edges beside the
+    points. `section` holds those edges where an instrument would pass, `sections` those at more places.
     """
 
     stamp_ns: int
@@ -49,6 +76,9 @@ class EdgeObservation:
     hidden: bool = False
     pose_used: bool = False
     camera_errors: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 3, 0)))
+    kinds: tuple[int, int] = (0, 0)
+    section: EdgeSection = field(default_factory=lambda: EdgeSection())
+    sections: tuple[EdgeSection, ...] = ()
 
     def flaw(self) -> str:
         """Why the observation cannot be used, in words; empty if it can."""
@@ -74,8 +104,9 @@ class EdgeObservation:
 class GapEstimate:
     """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
 
-    `points` (2, 3) are in the frame `frame_id`. `shares` (4,) divide the variance among image, lens position,
-    lens rotation and common part. `reason` says why the status is not VALID; it is not in the message.
+    `points` (2, 3), `instrument_point` (3,) and `instrument_axis` (3,) are in the frame `frame_id`. `shares`
+    (6,) divide the variance among image, lens position, lens rotation, common part, edges and shape.
+    `rejection` is why the status is not VALID, None if it is.
     """
 
     stamp_ns: int
@@ -90,10 +121,22 @@ class GapEstimate:
     confidence_level: float = NAN
     confidence_min: float = NAN
     confidence_max: float = NAN
+    instrument_point: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, NAN))
+    instrument_axis: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(3, NAN))
+    point_distance: float = NAN
+    point_distance_min: float = NAN
+    point_distance_max: float = NAN
+    point_distance_confidence_min: float = NAN
+    point_distance_confidence_max: float = NAN
     baseline: float = NAN
     parallax: float = NAN
     view_count: int = 0
     translation_to_target: float = NAN
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
-    shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(4, NAN))
-    reason: str = ""
+    shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(6, NAN))
+    rejection: "Rejection | None" = None
+
+    @property
+    def reason(self) -> str:
+        """Why the status is not VALID, in words; empty where it is."""
+        return str(self.rejection) if self.rejection is not None else ""

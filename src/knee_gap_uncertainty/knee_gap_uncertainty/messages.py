@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
+from knee_gap_uncertainty.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import ScopeCalibration
@@ -14,7 +15,32 @@ from knee_gap_uncertainty.scope_turns import ScopeTurn
 VALID_EDGES = 1
 TARGETS = {"snr": 0, "width": 1}
 INTERVALS = {"worst_case": 0, "paper": 1}
-SHARES = ("share_image", "share_lens_position", "share_lens_rotation", "share_common")
+SHARES = (
+    "share_image",
+    "share_lens_position",
+    "share_lens_rotation",
+    "share_common",
+    "share_edge",
+    "share_shape",
+)
+# Plain numbers of GapEstimate, under the same name in the message.
+NUMBERS = (
+    "gap",
+    "gap_min",
+    "gap_max",
+    "snr",
+    "confidence_level",
+    "confidence_min",
+    "confidence_max",
+    "point_distance",
+    "point_distance_min",
+    "point_distance_max",
+    "point_distance_confidence_min",
+    "point_distance_confidence_max",
+    "baseline",
+    "parallax",
+    "translation_to_target",
+)
 
 
 def stamp_ns(header: Any) -> int:
@@ -36,7 +62,27 @@ def edges_from_message(message: Any) -> EdgeObservation:
         hidden=bool(message.hidden_0) or bool(message.hidden_1),
         pose_used=bool(message.pose_used),
         camera_errors=_camera_errors(message),
+        kinds=(int(message.kind_0), int(message.kind_1)),
+        section=EdgeSection(
+            states=(int(message.edge_state_0), int(message.edge_state_1)),
+            bearings=_edge_bearings(message),
+            deviations=np.array([message.edge_deviation_0, message.edge_deviation_1], dtype=float),
+            error=float(message.edge_error),
+        ),
+        sections=tuple(_section(section) for section in message.sections),
     )
+
+
+def _edge_bearings(message: Any) -> npt.NDArray[np.float64]:
+    """Bearings (2, 3) of the edges of a knee_gap_msgs/GapEdges or GapSection."""
+    return np.array([[e.x, e.y, e.z] for e in (message.edge_0, message.edge_1)], dtype=float)
+
+
+def _section(message: Any) -> EdgeSection:
+    """Edges of a knee_gap_msgs/GapSection."""
+    bearings, error = _edge_bearings(message), float(message.edge_error)
+    state = EdgeState.SEEN if np.isfinite(bearings).all() and np.isfinite(error) else EdgeState.UNKNOWN
+    return EdgeSection((state, state), bearings, np.full(2, error / 3.0), error)
 
 
 def _camera_errors(message: Any) -> npt.NDArray[np.float64]:
@@ -92,15 +138,32 @@ def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
     message.status = int(estimate.status)
     message.track_id = estimate.track_id
     message.interval = INTERVALS[estimate.interval]
-    for name in ("gap", "gap_min", "gap_max", "snr", "confidence_level", "confidence_min", "confidence_max"):
-        setattr(message, name, float(getattr(estimate, name)))
-    for name in ("baseline", "parallax", "translation_to_target"):
+    message.reason = estimate.reason
+    for name in NUMBERS:
         setattr(message, name, float(getattr(estimate, name)))
     message.view_count = estimate.view_count
-    for point, values in zip((message.point_0, message.point_1), estimate.points, strict=True):
-        point.x, point.y, point.z = (float(value) for value in values)
+    triples = (
+        (message.point_0, estimate.points[0]),
+        (message.point_1, estimate.points[1]),
+        (message.instrument_point, estimate.instrument_point),
+        (message.instrument_axis, estimate.instrument_axis),
+    )
+    for target, values in triples:
+        target.x, target.y, target.z = (float(value) for value in values)
     for name, share in zip(SHARES, estimate.shares, strict=True):
         setattr(message, name, float(share))
+    return message
+
+
+def fill_gap_profile(message: Any, profile: GapProfile) -> Any:
+    """Set every field of a default-constructed knee_gap_msgs/GapProfile; returns the message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(profile.stamp_ns, 1_000_000_000)
+    message.header.frame_id = profile.frame_id
+    message.track_id = profile.track_id
+    for name in ("position", "gap", "gap_min", "gap_max"):
+        setattr(message, name, np.array(getattr(profile, name), dtype=np.float64))
+    message.widest = profile.widest
+    message.chosen_is_widest = profile.chosen_is_widest
     return message
 
 

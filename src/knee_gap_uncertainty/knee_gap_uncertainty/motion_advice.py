@@ -13,13 +13,22 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import norm
 
 from knee_gap_node.parameter_rules import broken_rule
-from knee_gap_uncertainty.confidence_interval import confidence_interval
+from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS
 from knee_gap_uncertainty.depth_drift import with_depth_drift
 from knee_gap_uncertainty.errors import BadInputError, MeasurementError
-from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.instrument_gap import (
+    Edges,
+    edge_points,
+    instrument_gap,
+    opening_of,
+    widest_gap,
+    worst_case,
+)
 from knee_gap_uncertainty.multi_view import fit
+from knee_gap_uncertainty.translation_volume import displacements
 from knee_gap_uncertainty.views import Views
 
 Floats = npt.NDArray[np.float64]
@@ -73,9 +82,10 @@ class Situation(NamedTuple):
     """What is known at an image; all in the frame of the poses, `frame_id` is that of the lens.
 
     `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
-    coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad] and `translation_error`
-    [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
-    vector of the present travel. `depth_drift` and `lasting_share` are the estimator's.
+    coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad], `image_error` [rad],
+    the part of it that is the image's alone, and `translation_error` [m] bound the errors; `views` are those of the track, the present one last; `direction` (3,) is the unit
+    vector of the present travel. `depth_drift` and `lasting_share` are the estimator's. `edges` are those of
+    the opening that the present lens sees.
     """
 
     stamp_ns: int
@@ -87,11 +97,13 @@ class Situation(NamedTuple):
     points: Floats
     direction: Floats
     angular_error: float
+    image_error: float
     translation_error: float
     interval: Literal["worst_case", "paper"]
     apex: Literal["first", "second", "best"]
     confidence_level: float
     views: Views
+    edges: Edges
     depth_drift: float = 0.0
     lasting_share: float = 0.0
 
@@ -125,25 +137,29 @@ class MotionAdvice(NamedTuple):
 
 
 def snr_after(situation: Situation, offset: Floats) -> float:
-    """Signal-to-noise ratio with the lens `offset` (3,) [m] further on; 0 where no range exists."""
+    """Signal-to-noise ratio of the gap `offset` (3,) [m] further on; 0 where it is unbounded."""
     lens = situation.lens + offset
-    try:
-        return gap_range(
-            situation.first_lens,
-            lens,
-            unit(situation.points - situation.first_lens),
-            unit(situation.points - lens),
-            angular_error=situation.angular_error,
-            translation_error=situation.translation_error,
-            interval=situation.interval,
-            apex=situation.apex,
-        ).snr
-    except MeasurementError:
+    if not float(np.linalg.norm(lens - situation.first_lens)) > 2.0 * situation.translation_error:
         return 0.0
+    edges = edges_after(situation, lens)
+    bearings = unit(situation.points - lens)
+    opening = opening_of(bearings, edges.bearings)
+    gap_min, gap_max = worst_case(
+        situation.first_lens - lens,
+        bearings,
+        unit(situation.points - situation.first_lens),
+        opening,
+        edges,
+        situation.angular_error,
+        situation.image_error,
+        displacements(situation.translation_error, 1),
+        SIGNS[INTERVAL_SIGNS[situation.interval]],
+    )
+    return widest_gap(situation.points, lens, opening, edges) / (gap_max - gap_min)
 
 
 def width_after(situation: Situation, offset: Floats) -> float:
-    """Width of the confidence interval [m] `offset` (3,) [m] further on; infinite where refused."""
+    """Width of the gap's confidence interval [m] `offset` (3,) [m] further on; infinite where refused."""
     try:
         views = views_after(situation, offset)
         fitted = fit(views)
@@ -152,8 +168,21 @@ def width_after(situation: Situation, offset: Floats) -> float:
     fitted = with_depth_drift(
         fitted, views, situation.first_lens, situation.depth_drift, situation.lasting_share
     )
-    interval = confidence_interval(fitted, situation.confidence_level)
-    return interval.upper - interval.lower
+    lens = situation.lens + offset
+    if not np.isfinite(fitted.points).all():
+        return inf
+    edges = edges_after(situation, lens)
+    opening = opening_of(unit(situation.points - lens), edges.bearings)
+    radius = float(norm.ppf(0.5 + 0.5 * situation.confidence_level))
+    found = instrument_gap(fitted, lens, opening, edges, radius)
+    return found.upper - found.lower
+
+
+def edges_after(situation: Situation, lens: Floats) -> Edges:
+    """The edges as another lens (3,) [m] sees them: at the same places of the tissue, as far as they go."""
+    opening = opening_of(unit(situation.points - situation.lens), situation.edges.bearings)
+    places = edge_points(situation.lens, situation.points, opening, situation.edges)
+    return situation.edges._replace(bearings=unit(places - lens))
 
 
 def views_after(situation: Situation, offset: Floats) -> Views:

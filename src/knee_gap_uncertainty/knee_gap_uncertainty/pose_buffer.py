@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from knee_gap_node.pose_continuity import PoseContinuity
 from knee_gap_uncertainty.errors import BadInputError
 
 Array = npt.NDArray[np.float64]
@@ -30,6 +31,7 @@ class LensPose:
     in the order x, y, z [m^2], rotation about the fixed axes x, y, z of `frame_id` [rad^2] (REP-103).
     `motion` (6,) is the velocity [m/s] and the turning about the same axes [rad/s], NaN where not known, as
     measured over `motion_time` [s]. `scope_turn` [rad] is how far the scope was turned in its camera head.
+    Poses of the same `segment` are continuous: no step lies between them, and no place that nobody saw.
     """
 
     stamp_ns: int
@@ -40,6 +42,7 @@ class LensPose:
     motion: Array = field(default_factory=lambda: np.full(6, np.nan))
     motion_time: float = np.inf
     scope_turn: float = 0.0
+    segment: int = 0
 
 
 class PoseRefusal(StrEnum):
@@ -53,6 +56,7 @@ class PoseRefusal(StrEnum):
     NOT_YET = "no lens pose follows the stamp yet"
     TOO_OLD = "the stamp is before the first lens pose that is kept"
     GAP = "a lens pose around the stamp is further from it than max_pose_age"
+    DISCONTINUOUS = "the lens pose made a step, or was lost, around the image"
 
 
 class PoseBuffer:
@@ -90,9 +94,16 @@ class PoseBuffer:
         self._acceleration = acceleration
         self._angular_acceleration = angular_acceleration
         self._poses: deque[LensPose] = deque(maxlen=capacity)
+        # Goes on counting when the buffer is emptied: poses after that are not continuous with those before.
+        self._continuity = PoseContinuity()
 
     def __len__(self) -> int:
         return len(self._poses)
+
+    @property
+    def discontinuity(self) -> str:
+        """Why the segment of the newest pose began, in constant words; empty for the first."""
+        return self._continuity.reason
 
     @property
     def newest_stamp_ns(self) -> int | None:
@@ -123,7 +134,10 @@ class PoseBuffer:
         self._repeats = self._repeats + 1 if self._poses and _same_place(pose, self._poses[-1]) else 0
         if self._repeats >= FROZEN_REPEATS:
             return PoseRefusal.FROZEN
-        self._poses.append(pose)
+        segment = self._continuity.take(
+            pose.stamp_ns, pose.frame_id, pose.position, pose.quaternion_xyzw, pose.covariance
+        )
+        self._poses.append(replace(pose, segment=segment))
         return None
 
     def at(self, stamp_ns: int) -> LensPose | PoseRefusal:
@@ -141,14 +155,22 @@ class PoseBuffer:
         age = round(self.max_pose_age * 1e9)
         if stamp_ns - before.stamp_ns > age or after.stamp_ns - stamp_ns > age:
             return PoseRefusal.GAP
+        if before.segment != after.segment:
+            return PoseRefusal.DISCONTINUOUS
         earlier = self._before(index)
         between = self._between(before, after, stamp_ns)
         return replace(between, motion=_motion(earlier, after), motion_time=_seconds(earlier, after))
 
     def _before(self, index: int) -> LensPose:
-        """The earliest pose within MOTION_TIME before that of an index, at least the one before it."""
-        start = self._poses[index].stamp_ns - MOTION_TIME_NS
-        return self._poses[min(bisect_left(self._poses, start, key=lambda pose: pose.stamp_ns), index - 1)]
+        """The earliest pose within MOTION_TIME before that of an index, at least the one before it.
+
+        Of the same segment: a step is no velocity.
+        """
+        start, segment = self._poses[index].stamp_ns - MOTION_TIME_NS, self._poses[index].segment
+        found = min(bisect_left(self._poses, start, key=lambda pose: pose.stamp_ns), index - 1)
+        while found < index - 1 and self._poses[found].segment != segment:
+            found += 1
+        return self._poses[found]
 
     def _near(self, index: int) -> LensPose:
         """The pose that tells the velocity at that of an index, before or after it; itself if none is near.
@@ -159,7 +181,11 @@ class PoseBuffer:
         others = [self._before(index)] if index else []
         if index + 1 < len(self._poses):
             others.append(self._poses[index + 1])
-        near = (other for other in others if abs(other.stamp_ns - pose.stamp_ns) <= longest_ns)
+        near = (
+            other
+            for other in others
+            if abs(other.stamp_ns - pose.stamp_ns) <= longest_ns and other.segment == pose.segment
+        )
         return next(near, pose)
 
     def _between(self, before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
@@ -178,6 +204,7 @@ class PoseBuffer:
             position=(1.0 - share) * before.position + share * after.position,
             quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
             covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
+            segment=after.segment,
         )
 
 

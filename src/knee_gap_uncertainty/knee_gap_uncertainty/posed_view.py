@@ -28,10 +28,13 @@ class PosedView(NamedTuple):
     view: Views
 
 
-def posed_view(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> PosedView:
+def posed_view(
+    edges: EdgeObservation, pose: LensPose, tracker_bound: float, camera_error: float = 0.0
+) -> PosedView:
     """View of `edges` from `pose`; tracked errors are bounded by `tracker_bound` times their RMS length.
 
-    Raises BadInputError for covariances that are none.
+    `camera_error` [-] is the relative standard error of a focal length that was not calibrated; it comes to
+    the errors of the camera that the edges state. Raises BadInputError for covariances that are none.
     """
     rotation = Rotation.from_quat(pose.quaternion_xyzw)
     matrix = rotation.as_matrix()
@@ -53,6 +56,23 @@ def posed_view(edges: EdgeObservation, pose: LensPose, tracker_bound: float) -> 
             lens_motions=np.nan_to_num(pose.motion)[None],
             motion_times=np.array([pose.motion_time]),
             scope_turns=np.array([pose.scope_turn]),
-            camera_errors=(matrix @ edges.camera_errors)[None],
+            camera_errors=(matrix @ _camera_errors(edges, camera_error))[None],
+            times=np.array([1e-9 * edges.stamp_ns]),
         ),
+    )
+
+
+def _camera_errors(edges: EdgeObservation, camera_error: float) -> Floats:
+    """(2, 3, k) what the edges state, and the displacement by a focal length that is wrong by a share.
+
+    A bearing at an angle from the axis of the picture goes away from it by that share of the angle.
+    """
+    if not camera_error > 0.0:
+        return edges.camera_errors
+    x, y, z = edges.bearings.T
+    across = np.hypot(x, y)
+    angle, size = np.arctan2(across, z), np.maximum(across, np.finfo(float).tiny)
+    outward = np.column_stack([x * z / size, y * z / size, -across])
+    return np.concatenate(
+        [edges.camera_errors, camera_error * (angle[:, None] * outward)[..., None]], axis=-1
     )

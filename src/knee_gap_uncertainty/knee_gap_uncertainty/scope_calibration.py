@@ -7,14 +7,19 @@ bearing by where it lies in the picture. None of it averages out, so it is no pa
 pose or a bearing: it is considered, as the common part of the image's error is. The gap's fit is taken as it
 is, and to its covariance comes what the shared error does to it. The camera's errors and those of the lens on
 its body are taken as independent, though one fit has found both and they mostly make up for each other.
+
+A body that creeps on its scope is the same in kind: one rate, not known, that moves the lens ever farther.
+What nobody calibrated has the errors that the parameters state: an uncalibrated scope is wide, not silent.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from knee_gap_uncertainty.depth_drift import widened
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.multi_view import MultiViewFit
 from knee_gap_uncertainty.posed_view import PosedView
 from knee_gap_uncertainty.views import Views
@@ -46,14 +51,6 @@ class ScopeCalibration:
     lens_covariance: Array
     time_offset_error: float
     turn_followed: bool = False
-
-    @property
-    def error(self) -> "CalibrationError | None":
-        """The error that views share, where `flaw` finds none in it; None where the node tells of none."""
-        seconds = 0.0 if np.isnan(self.time_offset_error) else self.time_offset_error
-        if not np.isnan(self.lens_covariance).all():
-            return CalibrationError(self.lens_covariance, seconds)
-        return CalibrationError(np.zeros((6, 6)), seconds) if seconds else None
 
     def flaw(self) -> str:
         """Why the error that is told cannot be one, in words; empty if it can."""
@@ -93,15 +90,38 @@ def contradiction(told: dict[str, ScopeCalibration]) -> str:
     return f"nodes use different calibrations of the scope: {each}"
 
 
+def shared_error(told: Iterable[ScopeCalibration], parameters: EstimatorParameters) -> "CalibrationError":
+    """The error that all views share: what calibrations state, and the parameters where none does.
+
+    A calibration without a hash, or one that has a `flaw`, states nothing.
+    """
+    used = [one for one in told if one.hash and not one.flaw()]
+    lens = (one.lens_covariance for one in used if not np.isnan(one.lens_covariance).all())
+    clock = (one.time_offset_error for one in used if not np.isnan(one.time_offset_error))
+    sizes = np.repeat([parameters.lens_position_error, parameters.lens_rotation_error], 3)
+    return CalibrationError(
+        covariance=next(lens, np.diag(sizes**2 / 3.0)),
+        clock=next(clock, parameters.clock_error),
+        camera=0.0 if used else parameters.camera_error,
+        drift=parameters.tracker_drift,
+        angular_drift=parameters.tracker_angular_drift,
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationError:
     """The shared error: `covariance` (6, 6) and `clock` [s] as in ScopeCalibration.
 
-    The camera's is told by the views themselves, as it depends on where a point lies in the picture.
+    `camera` [-] is the relative error of a focal length that was not calibrated; the views themselves carry
+    what it does, as it depends on where a point lies in the picture. `drift` [m/s] and `angular_drift`
+    [rad/s] are RMS lengths of the rates at which the lens creeps on the tracked body from the first view on.
     """
 
     covariance: Array
     clock: float
+    camera: float = 0.0
+    drift: float = 0.0
+    angular_drift: float = 0.0
 
     def widened(self, fit: MultiViewFit, views: Views) -> MultiViewFit:
         """The fit with the shared error in its covariances and in the common part of its shares."""
@@ -122,14 +142,16 @@ class CalibrationError:
         late = (motions[1][:3] - motions[0][:3]) / 2.0 * self.clock
         turned = max(float(motion[3:] @ motion[3:]) for motion in motions) * self.clock**2
         seen = max(_largest_displacement(view.view) for view in (first, present))
-        angle = np.sqrt(np.trace(turn) + turned + seen**2)
-        position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late)
+        seconds = 1e-9 * (present.stamp_ns - first.stamp_ns)
+        angle = np.sqrt(np.trace(turn) + turned + seen**2 + (self.angular_drift * seconds) ** 2)
+        crept = self.drift * seconds / 2.0
+        position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late + crept**2)
         return factor * float(angle), factor * float(position)
 
     def root(self, count: int) -> Array:
         """(count, count) whose product with its transpose is the covariance of all shared errors.
 
-        They are shift, rotation and clock, and then those of the camera, which have a variance of 1.
+        They are shift, rotation and clock, and then those of the camera and the drift, of a variance of 1.
         """
         root = np.eye(count)
         values, vectors = np.linalg.eigh(self.covariance)
@@ -138,7 +160,7 @@ class CalibrationError:
         return root
 
     def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
-        """(6, 7 + k): how far the estimated points go with shift, rotation [rad], clock [s] and camera.
+        """(6, 7 + k + 6): how far the estimated points go with shift, rotation, clock, camera and drift.
 
         By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
         moves all lenses alike moves the points with them, and their distance not at all.
@@ -146,7 +168,8 @@ class CalibrationError:
         rotations = views.calibrated_rotations
         motions = _motions(views)
         by_camera = _camera_errors(views)
-        count = 7 + by_camera.shape[-1]
+        camera = slice(7, 7 + by_camera.shape[-1])
+        count = camera.stop + 6
         moved = np.zeros((6, count))
         lens_moved = np.zeros((len(views), 3, count))
         lens_moved[:, :, :3] = rotations - rotations[-1]
@@ -154,6 +177,9 @@ class CalibrationError:
         turned = np.zeros((len(views), 3, count))
         turned[:, :, 3:6] = rotations
         turned[:, :, 6] = motions[:, 3:]
+        crept = rotations * _seconds(views)[:, None, None] / np.sqrt(3.0)
+        lens_moved[:, :, camera.stop : camera.stop + 3] = self.drift * (crept - crept[-1])
+        turned[:, :, camera.stop + 3 :] = self.angular_drift * crept
         lens_variance = np.trace(views.lens_covariances, axis1=1, axis2=2) / 3.0
         rotation_variance = np.trace(views.rotation_covariances, axis1=1, axis2=2) / 3.0
         for n in range(2):
@@ -167,7 +193,7 @@ class CalibrationError:
             weight = 1.0 / (variance * length**2)
             # A lens that moves takes its ray along; a bearing b that turns by r goes by r x b.
             aside = lens_moved[used] - length[:, None, None] * (_cross(bearing) @ turned[used])
-            aside[:, :, 7:] += length[:, None, None] * by_camera[used, n]
+            aside[:, :, camera] += length[:, None, None] * by_camera[used, n]
             normal = np.einsum("i,ijk->jk", weight, across)
             right = np.einsum("i,ijk,ikl->jl", weight, across, aside)
             moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
@@ -177,6 +203,11 @@ class CalibrationError:
 def _motions(views: Views) -> Array:
     """(N, 6) velocity [m/s] and turning [rad/s] of the lens; zero where it is not known."""
     return np.zeros((len(views), 6)) if views.lens_motions is None else views.lens_motions
+
+
+def _seconds(views: Views) -> Array:
+    """(N,) time since the first view [s]; zero where it is not known."""
+    return np.zeros(len(views)) if views.times is None else views.times - views.times[0]
 
 
 def _camera_errors(views: Views) -> Array:

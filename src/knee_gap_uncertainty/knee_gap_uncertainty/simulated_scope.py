@@ -5,10 +5,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import ScopeCalibration
 from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -92,7 +95,7 @@ def wrong_scope(
     """The estimator on a track with an error drawn from what is stated; a point may move on the way."""
     rng = np.random.default_rng([seed, 11])
     hand = Hand(rng, drawn(rng, shift, turn, clock))
-    estimator, found = GapEstimator(), []
+    estimator, found = GapEstimator(EXACT), []
     for node, covariance, error in (
         ("tracking_node", stated(shift, turn), clock),
         ("segmentation_node", np.full((6, 6), np.nan), np.nan),

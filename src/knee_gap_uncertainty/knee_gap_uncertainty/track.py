@@ -5,50 +5,47 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+from scipy.stats import norm
 
+from knee_gap_uncertainty.acceptance import Facts, Kept, judge
+from knee_gap_uncertainty.angle_sets import INTERVAL_SIGNS, SIGNS
 from knee_gap_uncertainty.calibration_fit import explained_by
 from knee_gap_uncertainty.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.depth_drift import with_depth_drift
-from knee_gap_uncertainty.errors import (
-    MeasurementError,
-    ParallelToTravelError,
-    RaysMeetBehindError,
-    TravelTooShortError,
-    UnboundedError,
-)
+from knee_gap_uncertainty.errors import MeasurementError, TravelTooShortError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_uncertainty.gap_profile import GapProfile, gap_profile
 from knee_gap_uncertainty.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.instrument_gap import (
+    Edges,
+    Opening,
+    admitted_ranges,
+    bounds_of_gap,
+    flaw_of,
+    instrument_gap,
+    opening_of,
+)
 from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_advice import Situation
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration import CalibrationError
+from knee_gap_uncertainty.section_edges import SectionInView
+from knee_gap_uncertainty.translation_volume import displacements
 from knee_gap_uncertainty.triangulation import triangulate
 from knee_gap_uncertainty.two_views import two_views
 from knee_gap_uncertainty.view_window import ViewWindow
 from knee_gap_uncertainty.views import Views
 
-# Why views give no number, without the values: a reason that is counted must stay the same.
-REASONS: dict[type[MeasurementError], str] = {
-    TravelTooShortError: "the scope has hardly moved",
-    ParallelToTravelError: "a point lies along the scope's travel",
-    RaysMeetBehindError: "the rays to a point do not meet in front of the scope",
-    UnboundedError: "the rays to a point are parallel",
-}
-UNBOUNDED = "the admitted errors leave the gap unbounded"
-UNCERTAIN_DEPTH = "the depth of a point is too uncertain"
-CONTRADICTION = "the estimate from all views lies outside the bounds from two of them"
-TOO_LARGE = "the gap is larger than any joint's"
-UNCHECKED = "two views cannot check each other"
-# Along the line of the ray from the other view, one of two views may be wrong by any amount.
-FEWEST_VIEWS_TO_CHECK = 3
-
+Floats = npt.NDArray[np.float64]
 
 # The direction of travel is that over this time [ns], if the lens went farther in it than this [m].
 DIRECTION_TIME_NS = 250_000_000
 DIRECTION_TRAVEL = 0.2e-3
+FEWEST_VIEWS = 2  # that show a depth
 
 
 class AllViews(NamedTuple):
@@ -67,29 +64,44 @@ class Track:
         track_id: int,
         frame_id: str,
         parameters: EstimatorParameters,
-        calibration: CalibrationError | None = None,
+        calibration: CalibrationError,
+        camera_columns: int = 0,
     ) -> None:
         self._calibration = calibration
+        self._camera_columns = camera_columns
+        # Edges that state no error of their camera have that of one which nobody calibrated.
+        self._camera_error = calibration.camera if camera_columns else parameters.camera_error
         self.track_id = track_id
         self.frame_id = frame_id
         self._parameters = parameters
         self._first: PosedView | None = None
+        self._segment = 0
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
         self._direction = np.full(3, np.nan)
         self._joint_motion = JointMotionTest()
+        self._section = SectionInView(parameters.longest_unseen_edges)
         self.ended = False
         # The last image that was found still, where the window does not keep it.
         self._passing: Views | None = None
         self.situation: Situation | None = None
+        # Of the present image, where it shows more sections and the gap is valid.
+        self.profile: GapProfile | None = None
 
     def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
-        """Whether the edges are of the same two points and the pose of the same reference frame."""
+        """Whether the edges are of the same points and camera, and the pose continues the earlier ones."""
         same = edges.track_id == self.track_id and pose.frame_id == self.frame_id
-        return same and not self.ended
+        # Errors of a camera are comparable with those of the same camera only.
+        same_camera = edges.camera_errors.shape[-1] == self._camera_columns
+        return same and same_camera and not self.breaks_at(pose) and not self.ended
+
+    def breaks_at(self, pose: LensPose) -> bool:
+        """Whether the lens made a step, or was lost, between the track's views and this pose."""
+        return self._first is not None and pose.segment != self._segment
 
     def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
+        self.profile = None
         blank = GapEstimate(
             stamp_ns=edges.stamp_ns,
             frame_id=self.frame_id,
@@ -99,34 +111,39 @@ class Track:
             confidence_level=self._parameters.confidence_level,
         )
         try:
-            view = posed_view(edges, pose, self._parameters.tracker_bound)
+            view = posed_view(edges, pose, self._parameters.tracker_bound, self._camera_error)
         except MeasurementError as error:
-            return replace(blank, status=GapStatus.NO_EDGES, reason=str(error))
+            return self._refused(blank, Facts(self._parameters, edges_flaw=str(error)))
         if self._first is None:
-            self._first = view
+            self._first, self._segment = view, pose.segment
         self._follow_direction(view)
+        blank = replace(
+            blank,
+            baseline=float(np.linalg.norm(view.lens - self._first.lens)),
+            view_count=len(self._window),
+        )
         views = self._views_with(view.view)
-        fitted, flaw = self._fitted(views)
+        fitted, no_fit = self._fitted(views)
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
-            return self._contradicted(blank, view, finding)
+            return self._contradicted(blank, finding)
         self._passing = None if self._window.add(view.view) else view.view
         if fitted is None:
-            return self._told(blank, view, flaw)
+            return self._refused(blank, Facts(self._parameters, error=no_fit))
         parameters = self._parameters
         fitted = with_depth_drift(
             fitted, views, self._first.lens, parameters.depth_drift, parameters.lasting_share
         )
-        if self._calibration is not None:
-            fitted = self._calibration.widened(fitted, views)
+        fitted = self._calibration.widened(fitted, views)
         try:
             interval = confidence_interval(fitted, self._parameters.confidence_level)
             all_views = AllViews(views, fitted, interval)
-            self.situation = self._situation(edges, view, all_views)
+            section = self._section.at(edges, view, _nearest(fitted.points, view.lens))
+            self.situation = self._situation(edges, view, all_views, section)
             bounds, parallax = self._bounds(self._first, view)
         except MeasurementError as error:
-            return self._told(blank, view, REASONS.get(type(error), str(error)))
-        return self._measured(blank, view, bounds, parallax, all_views)
+            return self._refused(blank, Facts(self._parameters, error=error))
+        return self._measured(blank, edges, view, bounds, parallax, all_views, section)
 
     def _views_with(self, present: Views) -> Views:
         """The views kept and then the present one, which is not kept before it has been found to fit them."""
@@ -139,26 +156,33 @@ class Track:
         self, views: Views, fitted: MultiViewFit | None
     ) -> tuple[Views, MultiViewFit | None, Views | None]:
         """The views, their fit and the passing view, less what the calibration's error explains of them."""
-        shared = explained_by(self._calibration, views) if self._calibration is not None else None
+        shared = explained_by(self._calibration, views)
         if shared is None:
             return views, fitted, self._passing
         passing = None if self._passing is None else shared.taken_from(self._passing)
         corrected = shared.taken_from(views)
         return corrected, self._fitted(corrected)[0], passing
 
-    def _fitted(self, views: Views) -> tuple[MultiViewFit | None, str]:
+    def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
+        if len(views) < FEWEST_VIEWS:
+            return None, TravelTooShortError("a single view shows no depth")
         try:
-            return fit(views), ""
+            return fit(views), None
         except MeasurementError as error:
-            return None, REASONS.get(type(error), str(error))
+            return None, error
 
-    def _contradicted(self, blank: GapEstimate, view: PosedView, finding: Finding) -> GapEstimate:
+    def _contradicted(self, blank: GapEstimate, finding: Finding) -> GapEstimate:
         """No number from an image whose points are not where the track has them; the track may end here."""
         self.ended = finding is Finding.MOVED
         self.situation = None
-        status = GapStatus.JOINT_MOVED if self.ended else GapStatus.UNKNOWN
-        return replace(self._told(blank, view, finding.value), status=status)
+        return self._refused(blank, Facts(self._parameters, finding=finding))
+
+    def _refused(self, blank: GapEstimate, facts: Facts) -> GapEstimate:
+        """What is known of every view, without a number, as the rule that the facts break has it."""
+        verdict = judge(facts)
+        assert verdict is not None
+        return replace(blank, status=verdict.status, rejection=verdict.rejection)
 
     def _follow_direction(self, present: PosedView) -> None:
         """Note where the lens is going; it keeps its direction while it stands still."""
@@ -170,11 +194,13 @@ class Track:
         if length > DIRECTION_TRAVEL:
             self._direction = travel / length
 
-    def _situation(self, edges: EdgeObservation, present: PosedView, all_views: AllViews) -> Situation | None:
-        """What advice on motion can be based on; None while the points are not known at all."""
+    def _situation(
+        self, edges: EdgeObservation, present: PosedView, all_views: AllViews, section: Edges | str
+    ) -> Situation | None:
+        """What advice on motion can be based on; None while the points or the edges are not known at all."""
         assert self._first is not None
         assert all_views.views.lens_rotations is not None
-        if not np.isfinite(all_views.fit.points).all():
+        if isinstance(section, str) or not np.isfinite(all_views.fit.points).all():
             return None
         angular_error, translation_error = self._error_bounds(self._first, present)
         return Situation(
@@ -187,6 +213,7 @@ class Track:
             points=all_views.fit.points,
             direction=self._direction,
             angular_error=angular_error,
+            image_error=edges.angular_error,
             translation_error=translation_error,
             interval=self._parameters.interval,
             apex=self._parameters.apex,
@@ -194,6 +221,7 @@ class Track:
             views=all_views.views,
             depth_drift=self._parameters.depth_drift,
             lasting_share=self._parameters.lasting_share,
+            edges=section,
         )
 
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
@@ -216,47 +244,142 @@ class Track:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
         angle = max(first.angular_error, present.angular_error)
         position = max(first.translation_error, present.translation_error)
-        if self._calibration is None:
-            return angle, position
         shared = self._calibration.bounds(first, present, self._parameters.tracker_bound)
         return angle + shared[0], position + shared[1]
 
     def _measured(
-        self, blank: GapEstimate, view: PosedView, bounds: GapRange, parallax: float, all_views: AllViews
+        self,
+        blank: GapEstimate,
+        observation: EdgeObservation,
+        view: PosedView,
+        bounds: GapRange,
+        parallax: float,
+        all_views: AllViews,
+        section: Edges | str,
     ) -> GapEstimate:
+        """The estimate from the points' bounds and fit, and from the edges beside them in this image."""
         _, fitted, interval = all_views
-        estimate = replace(
-            self._told(blank, view, ""),
-            gap_min=bounds.gap_min,
-            gap_max=bounds.gap_max,
-            snr=0.0,
-            confidence_min=interval.lower,
-            confidence_max=interval.upper,
+        measured = replace(
+            blank,
+            status=GapStatus.VALID,
+            point_distance=fitted.gap,
+            point_distance_min=bounds.gap_min,
+            point_distance_max=bounds.gap_max,
+            point_distance_confidence_min=interval.lower,
+            point_distance_confidence_max=interval.upper,
             parallax=parallax,
             view_count=fitted.view_count,
-            shares=fitted.shares,
-        )
-        if self._joint_motion.still_count < FEWEST_VIEWS_TO_CHECK:
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCHECKED)
-        if not np.isfinite(bounds.gap_max):
-            return replace(estimate, reason=UNBOUNDED)
-        if interval.refused or not np.isfinite(fitted.gap):
-            # The lower bounds stand; an upper one must not be taken for an answer.
-            return replace(estimate, gap_max=np.inf, confidence_max=np.inf, reason=UNCERTAIN_DEPTH)
-        if fitted.gap > self._parameters.largest_gap:
-            return replace(self._told(blank, view, TOO_LARGE), status=GapStatus.UNKNOWN)
-        if not bounds.gap_min <= fitted.gap <= bounds.gap_max:
-            return replace(self._told(blank, view, CONTRADICTION), status=GapStatus.UNKNOWN)
-        return replace(
-            estimate,
-            status=GapStatus.VALID,
-            gap=fitted.gap,
-            snr=fitted.gap / (bounds.gap_max - bounds.gap_min),
             points=fitted.points,
         )
+        section_flaw = section if isinstance(section, str) else ""
+        if not isinstance(section, str):
+            opening = opening_of(view.bearings, section.bearings)
+            section_flaw = flaw_of(opening)
+            if not section_flaw:
+                measured = self._with_gap(measured, observation, view, fitted, opening, section)
+        facts = Facts(
+            self._parameters,
+            section_flaw=section_flaw,
+            at_border=not isinstance(section, str) and not section.bounded,
+            measured=measured,
+            depth_refused=bool(interval.refused),
+            still_count=self._joint_motion.still_count,
+            distance=float(np.linalg.norm(fitted.points - view.lens, axis=1).max()),
+        )
+        verdict = judge(facts)
+        if verdict is None:
+            return measured
+        self.profile = None
+        if verdict.kept is Kept.NOTHING:
+            return self._refused(blank, facts)
+        # The lower bounds stand; an upper one must not be taken for an answer.
+        return replace(
+            blank,
+            status=verdict.status,
+            rejection=verdict.rejection,
+            gap_min=measured.gap_min,
+            gap_max=np.inf,
+            snr=0.0,
+            confidence_min=measured.confidence_min,
+            confidence_max=np.inf,
+            point_distance_min=bounds.gap_min,
+            point_distance_max=np.inf,
+            point_distance_confidence_min=interval.lower,
+            point_distance_confidence_max=np.inf,
+            parallax=parallax,
+            view_count=fitted.view_count,
+            shares=measured.shares,
+        )
 
-    def _told(self, blank: GapEstimate, view: PosedView, reason: str) -> GapEstimate:
-        """What is known of every view: how far the lens has come, and the reason why there is no more."""
+    def _with_gap(
+        self,
+        measured: GapEstimate,
+        observation: EdgeObservation,
+        view: PosedView,
+        fitted: MultiViewFit,
+        opening: Opening,
+        edges: Edges,
+    ) -> GapEstimate:
+        """The estimate with the instrument gap, its bounds and its interval."""
+        near, far = self._admitted_ranges(view, opening)
+        gap_min, gap_max = bounds_of_gap(near, far, opening, edges, observation.angular_error)
+        if not np.isfinite(fitted.points).all():
+            return replace(measured, gap_min=gap_min, gap_max=np.inf, confidence_min=0.0)
+        radius = float(norm.ppf(0.5 + 0.5 * self._parameters.confidence_level))
+        found = instrument_gap(fitted, view.lens, opening, edges, radius)
+        if observation.sections:
+            self.profile = self._profile(observation, view, fitted, (near, far), opening, edges)
+        width = gap_max - gap_min
+        return replace(
+            measured,
+            gap=found.gap,
+            gap_min=gap_min,
+            gap_max=gap_max,
+            snr=found.gap / width if width > 0.0 else np.inf,
+            confidence_min=found.lower,
+            confidence_max=found.upper,
+            instrument_point=found.point,
+            instrument_axis=found.axis,
+            shares=np.append(fitted.shares * (1.0 - found.shares.sum()), found.shares),
+        )
+
+    def _admitted_ranges(self, present: PosedView, opening: Opening) -> tuple[Floats, Floats]:
+        """Distances (m, 2) [m] of the points that the errors of the first and the present view allow."""
         assert self._first is not None
-        baseline = float(np.linalg.norm(view.lens - self._first.lens))
-        return replace(blank, baseline=baseline, view_count=len(self._window), reason=reason)
+        angular_error, translation_error = self._error_bounds(self._first, present)
+        return admitted_ranges(
+            self._first.lens - present.lens,
+            present.bearings,
+            self._first.bearings,
+            opening,
+            angular_error,
+            displacements(translation_error, 1),
+            SIGNS[INTERVAL_SIGNS[self._parameters.interval]],
+        )
+
+    def _profile(
+        self,
+        observation: EdgeObservation,
+        view: PosedView,
+        fitted: MultiViewFit,
+        near_far: tuple[Floats, Floats],
+        opening: Opening,
+        edges: Edges,
+    ) -> GapProfile:
+        assert view.view.lens_rotations is not None
+        return gap_profile(
+            observation.stamp_ns,
+            self.frame_id,
+            self.track_id,
+            observation.sections,
+            view.view.lens_rotations[0],
+            np.linalg.norm(fitted.points - view.lens, axis=1) * opening.in_plane,
+            near_far,
+            opening,
+            edges,
+        )
+
+
+def _nearest(points: Floats, lens: Floats) -> float:
+    """Distance [m] of the nearer point (2, 3) from a lens (3,); infinite where neither is known."""
+    return float(np.nanmin(np.linalg.norm(points - lens, axis=1), initial=np.inf))

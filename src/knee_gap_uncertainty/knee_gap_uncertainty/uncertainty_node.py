@@ -4,14 +4,17 @@ import time
 from collections.abc import Mapping, Sequence
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate, MotionAdvice, ScopeCalibration, ScopeTurn
+from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeTurn
 from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_uncertainty import gap_estimate, messages
+from knee_gap_uncertainty.acceptance import Reason
 from knee_gap_uncertainty.advice_task import AdvicePace
+from knee_gap_uncertainty.delays import ContinuedClock
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.motion_advice import AdviceParameters
@@ -31,8 +34,6 @@ class UncertaintyNode(BaseNode):
         self._advice_parameters = self.declare(AdviceParameters)
         self._estimator = GapEstimator(self.declare(EstimatorParameters), self._advice_parameters)
         self.refuse_unknown_parameters()
-        # Compiled before the first image, so that its estimate is not late.
-        warm_up()
         gap_qos = QoSProfile(
             depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=GAP_DEADLINE
         )
@@ -42,6 +43,12 @@ class UncertaintyNode(BaseNode):
             for topic, name in (("min", "gap_min"), ("max", "gap_max"), ("snr", "snr"))
         }
         self._advice = self.create_publisher(MotionAdvice, "motion_advice", RESULT_QOS)
+        self._profile = self.create_publisher(GapProfile, "gap_profile", RESULT_QOS)
+        self._clock = ContinuedClock()
+        # Said before the first image comes, so that a deadline can fire from now on.
+        self.publish(self._estimator.begin(self.now_ns()))
+        # Compiled before the first image, so that its estimate is not late.
+        warm_up()
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         # What waits is taken in this order: the turn that is told with a pose before the pose.
         self.create_subscription(ScopeTurn, "scope_turn", self.on_turn, RESULT_QOS)
@@ -54,7 +61,8 @@ class UncertaintyNode(BaseNode):
         )
         self.create_subscription(ScopeCalibration, "scope_calibration", self.on_calibration, calibration_qos)
         self._pace = AdvicePace(TICK)
-        self._tick = self.create_timer(TICK, self.on_tick)
+        # By the steady clock: silence must be reported when /clock has stopped too.
+        self._tick = self.create_timer(TICK, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_tick(self) -> None:
         """Let time pass: estimates that must not wait any longer, and advice that has become ready."""
@@ -100,18 +108,24 @@ class UncertaintyNode(BaseNode):
             self.get_logger().error(flaw)
 
     def now_ns(self) -> int:
-        """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""
-        return int(self.get_clock().now().nanoseconds)
+        """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer.
+
+        It goes on when /clock has stopped: whoever waits for an image or a pose then would wait for ever.
+        """
+        return self._clock.read(int(self.get_clock().now().nanoseconds), time.monotonic_ns())
 
     def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
         """Publish each estimate; the plain numbers only where they are valid."""
-        for estimate in estimates:
+        for measured in estimates:
+            estimate = self._estimator.leaving(measured, self.now_ns())
             self._gap.publish(messages.fill_gap_estimate(GapEstimate(), estimate))
             if estimate.status is gap_estimate.GapStatus.VALID:
                 for name, publisher in self._numbers.items():
                     publisher.publish(Float64(data=float(getattr(estimate, name))))
-            elif estimate.reason:
-                self.log_once(estimate.reason, f"{estimate.status.name}: {estimate.reason}")
+            elif estimate.rejection is not None:
+                self.log_once(estimate.rejection.reason, f"{estimate.status.name}: {estimate.reason}")
+        while self._estimator.profiles:
+            self._profile.publish(messages.fill_gap_profile(GapProfile(), self._estimator.profiles.popleft()))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""
@@ -121,9 +135,9 @@ class UncertaintyNode(BaseNode):
         }
         counts.update(self._estimator.counts)
         if latest is None:
-            return False, self._estimator.calibration_flaw or "no edges received yet", counts
+            return False, self._estimator.calibration_flaw or Reason.NOTHING_YET.value, counts
         well = latest.status is gap_estimate.GapStatus.VALID
-        return well, latest.reason or latest.status.name, counts
+        return well, self._estimator.calibration_flaw or latest.reason or latest.status.name, counts
 
 
 def main(argv: Sequence[str] | None = None) -> int:

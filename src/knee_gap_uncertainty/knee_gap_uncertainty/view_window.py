@@ -61,6 +61,7 @@ class ViewWindow:
         motions = [view.lens_motions for view in self._views if view.lens_motions is not None]
         times = [view.motion_times for view in self._views if view.motion_times is not None]
         turns = [view.scope_turns for view in self._views if view.scope_turns is not None]
+        seconds = [view.times for view in self._views if view.times is not None]
         return Views(
             lens_positions=np.concatenate([view.lens_positions for view in self._views]),
             bearings=np.concatenate([view.bearings for view in self._views]),
@@ -72,6 +73,7 @@ class ViewWindow:
             lens_motions=np.concatenate(motions) if len(motions) == len(self._views) else None,
             motion_times=np.concatenate(times) if len(times) == len(self._views) else None,
             scope_turns=np.concatenate(turns) if len(turns) == len(self._views) else None,
+            times=np.concatenate(seconds) if len(seconds) == len(self._views) else None,
             camera_errors=all_camera_errors(self._views),
         )
 

@@ -34,6 +34,7 @@ class Views:
     they are not known. `camera_errors` (N, 2, 3, k) are displacements of the bearings [rad], one for each
     error of the camera's own numbers, which all views share; None where there are none.
     `scope_turns` (N,) [rad] say how far the scope was turned in its camera head; None where it was not.
+    `times` (N,) [s] are the stamps of the images; None where they are not known.
 
     Raises BadInputError for the first value that breaks a rule.
     """
@@ -49,6 +50,7 @@ class Views:
     motion_times: Array | None = None
     camera_errors: Array | None = None
     scope_turns: Array | None = None
+    times: Array | None = None
 
     def __post_init__(self) -> None:
         """Bring the arrays into contiguous float64 and check them."""
@@ -108,6 +110,7 @@ class Views:
         motions = (self.lens_motions, other.lens_motions)
         times = (self.motion_times, other.motion_times)
         turns = (self.scope_turns, other.scope_turns)
+        seconds = (self.times, other.times)
         return Views(
             lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
             bearings=np.concatenate([self.bearings, other.bearings]),
@@ -128,6 +131,9 @@ class Views:
             scope_turns=None
             if turns[0] is None or turns[1] is None
             else np.concatenate([turns[0], turns[1]]),
+            times=None
+            if seconds[0] is None or seconds[1] is None
+            else np.concatenate([seconds[0], seconds[1]]),
         )
 
     def __len__(self) -> int:

@@ -4,7 +4,9 @@ import itertools
 
 import pytest
 
+from knee_gap_bringup import simulated_calibration
 from knee_gap_bringup.launch_plan import (
+    CALIBRATION_FILE,
     NODES,
     Next,
     PlannedProcess,
@@ -77,6 +79,17 @@ def test_what_stands_beside_a_bag_is_of_the_tracked_body_alone(bag):
     plan = replay_plan(str(bag), "", params="mine.yaml")
     assert all("mine.yaml" in process.parameters for process in plan if process.role is Role.NODE)
     assert not any(str(beside) in process.parameters for process in plan)
+
+
+def test_a_calibration_beside_a_bag_is_for_both_nodes_that_use_one(bag):
+    (bag / "scope.yaml").touch()
+    (bag / CALIBRATION_FILE).touch()
+    segmentation, tracking, uncertainty, _ = replay_plan(str(bag), "")
+    given = {"calibration_file": str(bag / CALIBRATION_FILE)}
+    assert tracking.parameters == (given,)
+    assert segmentation.parameters[0] == given
+    assert uncertainty.parameters == ()
+    assert CALIBRATION_FILE == simulated_calibration.CALIBRATION_FILE
 
 
 @pytest.mark.parametrize("namespace", ["knee_gap", "/knee_gap", "/knee_gap/"])

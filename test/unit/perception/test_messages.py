@@ -112,12 +112,19 @@ def test_compressed_images_that_cannot_be_used_are_refused(
         image_from_compressed(compressed(data, description))
 
 
+def blank_vector() -> SimpleNamespace:
+    return SimpleNamespace(x=0.0, y=0.0, z=0.0)
+
+
+def blank_section() -> SimpleNamespace:
+    return SimpleNamespace(edge_0=blank_vector(), edge_1=blank_vector(), edge_error=0.0)
+
+
 def blank_edges() -> SimpleNamespace:
     stamp = SimpleNamespace(sec=0, nanosec=0)
     return SimpleNamespace(
         header=SimpleNamespace(stamp=stamp, frame_id=""),
-        bearing_0=SimpleNamespace(x=0.0, y=0.0, z=0.0),
-        bearing_1=SimpleNamespace(x=0.0, y=0.0, z=0.0),
+        **{f"{name}_{index}": blank_vector() for name in ("bearing", "edge") for index in (0, 1)},
     )
 
 
@@ -136,7 +143,7 @@ def test_edges_fill_every_field_of_the_message() -> None:
         hidden=(False, True),
         pose_used=True,
     )
-    filled = fill_gap_edges(blank_edges(), edges)
+    filled = fill_gap_edges(blank_edges(), edges, blank_section)
     assert stamp_ns(filled.header) == edges.stamp_ns
     assert filled.header.frame_id == "lens"
     assert (filled.status, filled.track_id) == (1, 7)
@@ -149,6 +156,8 @@ def test_edges_fill_every_field_of_the_message() -> None:
 
 
 def test_unknown_points_are_nan_in_the_message() -> None:
-    filled = fill_gap_edges(blank_edges(), GapEdges.without_points(5, "lens", EdgeStatus.NO_GAP))
+    filled = fill_gap_edges(
+        blank_edges(), GapEdges.without_points(5, "lens", EdgeStatus.NO_GAP), blank_section
+    )
     assert (filled.status, filled.track_id, filled.kind_0) == (2, 0, 0)
     assert np.isnan([filled.bearing_0.x, *filled.pixel_0, *filled.covariance_1, filled.angular_error]).all()

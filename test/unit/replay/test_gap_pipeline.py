@@ -17,7 +17,9 @@ from knee_gap_replay.processing import Output
 from knee_gap_replay.topics import InputTopics
 from knee_gap_replay.types import blank
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -107,7 +109,7 @@ def run(
     end_ns: int, poses_until_ns: int, leg_at: Callable[[int], float | None] | None = None
 ) -> list[Output]:
     """Outputs for a scope tracked until a stamp; `leg_at`: where the leg body is, None where it is lost."""
-    parameters = EstimatorParameters(leg_motion=0.5e-3 if leg_at else 0.0)
+    parameters = EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3 if leg_at else 0.0)
     pipeline = GapPipeline(
         cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(parameters), TOPICS, "/space"
     )
@@ -191,7 +193,7 @@ def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
 
 def test_every_output_is_announced_with_its_type() -> None:
     pipeline = GapPipeline(
-        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
+        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(EXACT), TOPICS, "/space"
     )
     outputs = run(2_500_000_000, 2_500_000_000)
     assert {o.topic for o in outputs} == set(pipeline.outputs)

@@ -13,9 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.pose_buffer import LensPose
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +110,7 @@ class Scope:
 
     def estimates(self, estimator: GapEstimator | None = None) -> list[GapEstimate]:
         """Let the estimator see and hear it all."""
-        estimator = estimator or GapEstimator()
+        estimator = estimator or GapEstimator(EXACT)
         found = []
         for k in range(IMAGES):
             for step in range(2):
@@ -209,7 +211,7 @@ def test_point_that_slips_along_its_ray_is_told_by_the_leg_body_only() -> None:
         for watched in (False, True):
             scope = Scope(np.random.default_rng(seed))
             slips(scope)
-            parameters = EstimatorParameters(leg_motion=0.5e-3 if watched else 0.0)
+            parameters = EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3 if watched else 0.0)
             estimates = scope.estimates(GapEstimator(parameters))
             wrong[watched] += len(scope.outside(estimates))
             if watched:
@@ -253,7 +255,7 @@ def test_scope_at_rest_whose_tracker_drifts(scope: Scope) -> None:
 
 def test_images_that_come_twice_change_nothing() -> None:
     once = Scope(np.random.default_rng(3)).estimates()
-    scope, estimator = Scope(np.random.default_rng(3)), GapEstimator()
+    scope, estimator = Scope(np.random.default_rng(3)), GapEstimator(EXACT)
     add_edges = estimator.add_edges
 
     def twice(edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
@@ -265,7 +267,7 @@ def test_images_that_come_twice_change_nothing() -> None:
 
 
 def test_bag_that_starts_again_gives_the_same_again() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     first = Scope(np.random.default_rng(4)).estimates(estimator)
     again = Scope(np.random.default_rng(4)).estimates(estimator)
     assert [repr(e) for e in again[-IMAGES:]] == [repr(e) for e in first[-IMAGES:]]

@@ -10,15 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_range import gap_range
 from knee_gap_uncertainty.pose_buffer import LensPose, PoseRefusal
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 MS = 1_000_000
 FRAME_NS = 16_666_667
 POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
 TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
+# In steps that a hand can make between two images.
+TRAVEL = [float(x) for x in np.linspace(0.0, 0.006, 13)]
 TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
 
 
@@ -55,7 +59,7 @@ def run(
 
 def test_one_estimate_an_image_and_exact_for_exact_views() -> None:
     positions = list(np.linspace(0.0, 0.006, 60))
-    estimates = run(GapEstimator(), positions)
+    estimates = run(GapEstimator(EXACT), positions)
     assert [e.stamp_ns for e in estimates] == [10**9 + k * FRAME_NS for k in range(60)]
     last = estimates[-1]
     assert last.status is GapStatus.VALID
@@ -70,17 +74,17 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
     positions = list(np.linspace(0.0, 0.006, 120))
     widths = []
     for drift, share in ((0.0, 0.0), (0.002, 0.0), (0.002, 1.0)):
-        parameters = EstimatorParameters(depth_drift=drift, lasting_share=share)
+        parameters = EstimatorParameters(**EXACT_SCOPE, depth_drift=drift, lasting_share=share)
         last = run(GapEstimator(parameters), positions)[-1]
         assert last.status is GapStatus.VALID
         widths.append(last.confidence_max - last.confidence_min)
     assert widths[0] < 0.99 * widths[1] < 0.98 * widths[2]
-    default = run(GapEstimator(), positions)[-1]
+    default = run(GapEstimator(EXACT), positions)[-1]
     assert default.confidence_max - default.confidence_min == pytest.approx(widths[2])
 
 
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
-    estimate = run(GapEstimator(), [0.0, 0.003, 0.005])[-1]
+    estimate = run(GapEstimator(EXACT), list(np.linspace(0.0, 0.005, 11)))[-1]
     first, now = edges(0, 0.0), edges(0, 0.005)
     expected = gap_range(
         [0, 0, 0],
@@ -98,13 +102,13 @@ def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
 
 
 def test_without_travel_nothing_is_valid_and_no_gap_is_told() -> None:
-    for estimate in run(GapEstimator(), [1e-12 * k for k in range(30)]):
+    for estimate in run(GapEstimator(EXACT), [1e-12 * k for k in range(30)]):
         assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
         assert math.isnan(estimate.gap)
 
 
 def test_image_waits_for_the_pose_after_it_and_is_never_extrapolated() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     estimator.add_pose(pose(10**9 - MS, 0.0), 10**9)
     assert estimator.add_edges(edges(10**9, 0.0), 10**9) == []
     assert estimator.advance(10**9 + 15 * MS) == []
@@ -113,7 +117,7 @@ def test_image_waits_for_the_pose_after_it_and_is_never_extrapolated() -> None:
 
 
 def test_tracking_lost_within_the_wait_and_said_once_an_image() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     run(estimator, list(np.linspace(0.0, 0.006, 30)))
     stamp = 10**9 + 30 * FRAME_NS
     assert estimator.add_edges(edges(stamp, 0.006), stamp) == []
@@ -125,7 +129,7 @@ def test_tracking_lost_within_the_wait_and_said_once_an_image() -> None:
 
 
 def test_poses_too_far_from_the_image_are_out_of_sync() -> None:
-    estimator = GapEstimator(EstimatorParameters(max_pose_age=0.02))
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE, max_pose_age=0.02))
     estimator.add_pose(pose(10**9 - 30 * MS, 0.0), 10**9)
     estimator.add_edges(edges(10**9, 0.0), 10**9)
     (estimate,) = estimator.add_pose(pose(10**9 + 30 * MS, 0.0), 10**9 + 10 * MS)
@@ -133,7 +137,7 @@ def test_poses_too_far_from_the_image_are_out_of_sync() -> None:
 
 
 def test_unusable_edges_and_silence_are_no_edges() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     run(estimator, list(np.linspace(0.0, 0.006, 30)))
     stamp = 10**9 + 30 * FRAME_NS
     (estimate,) = estimator.add_edges(edges(stamp, 0.006, usable=False), stamp)
@@ -146,26 +150,26 @@ def test_unusable_edges_and_silence_are_no_edges() -> None:
 
 
 def test_another_track_starts_from_its_own_first_view() -> None:
-    estimator = GapEstimator()
-    assert run(estimator, [0.0, 0.003, 0.006])[-1].status is GapStatus.VALID
+    estimator = GapEstimator(EXACT)
+    assert run(estimator, TRAVEL)[-1].status is GapStatus.VALID
     estimates = run(estimator, [0.006, 0.006], track_id=2, begin=2 * 10**9)
     assert {e.status for e in estimates} == {GapStatus.INSUFFICIENT_PARALLAX}
     assert {e.baseline for e in estimates} == {0.0}
 
 
 def test_bag_that_starts_again_keeps_nothing_of_before() -> None:
-    estimator = GapEstimator()
-    before = run(estimator, [0.0, 0.003, 0.006])
-    again = run(estimator, [0.0, 0.003, 0.006])
+    estimator = GapEstimator(EXACT)
+    before = run(estimator, TRAVEL)
+    again = run(estimator, TRAVEL)
     assert [e.status for e in again] == [e.status for e in before]
     assert [e.gap for e in again] == pytest.approx([e.gap for e in before], nan_ok=True)
     assert estimator.counts["stamps ran backwards"] == 1
 
 
 def test_other_reference_frame_ends_the_track() -> None:
-    estimator = GapEstimator()
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    estimator = GapEstimator(EXACT)
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     estimator.add_pose(pose(stamp - MS, 0.006, "tibia"), stamp)
     estimator.add_edges(edges(stamp, 0.006), stamp)
     (estimate,) = estimator.add_pose(pose(stamp + MS, 0.006, "tibia"), stamp)
@@ -175,9 +179,9 @@ def test_other_reference_frame_ends_the_track() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 2.0, 0.0])
 def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
-    estimator = GapEstimator()
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    estimator = GapEstimator(EXACT)
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     broken = edges(stamp, 0.006)
     broken = replace(broken, bearings=broken.bearings * bad)
     estimator.add_pose(pose(stamp - MS, 0.006), stamp)
@@ -190,7 +194,7 @@ def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
 
 def test_pose_that_is_repeated_under_new_stamps_is_lost_tracking() -> None:
     """Whoever sends the pose: no old value is taken for a new one while the scope moves on."""
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     assert run(estimator, list(np.linspace(0.0, 0.006, 30)))[-1].status is GapStatus.VALID
     begin = 10**9 + 30 * FRAME_NS
     frozen = run(estimator, [0.006] * 30, begin=begin) + estimator.advance(begin + 40 * FRAME_NS)
@@ -202,9 +206,9 @@ def test_pose_that_is_repeated_under_new_stamps_is_lost_tracking() -> None:
 
 def test_bound_below_its_own_standard_deviation_is_refused() -> None:
     """The worst case of an error whose bound contradicts its covariance would be none."""
-    estimator = GapEstimator()
-    run(estimator, [0.0, 0.003, 0.006])
-    stamp = 10**9 + 3 * FRAME_NS
+    estimator = GapEstimator(EXACT)
+    run(estimator, TRAVEL)
+    stamp = 10**9 + len(TRAVEL) * FRAME_NS
     edge = replace(edges(stamp, 0.006), angular_error=np.radians(0.05))
     (estimate,) = estimator.add_edges(edge, stamp)
     assert estimate.status is GapStatus.NO_EDGES
@@ -212,7 +216,7 @@ def test_bound_below_its_own_standard_deviation_is_refused() -> None:
 
 
 def test_rubbish_poses_are_counted_and_not_used() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     bad = replace(pose(10**9, 0.0), position=np.array([np.nan, 0.0, 0.0]))
     assert estimator.add_pose(bad, 10**9) == []
     assert sum(n for key, n in estimator.counts.items() if key.startswith("pose refused")) == 1
@@ -220,7 +224,7 @@ def test_rubbish_poses_are_counted_and_not_used() -> None:
 
 def test_same_messages_give_same_answers() -> None:
     positions = list(np.linspace(0.0, 0.006, 40))
-    first, second = run(GapEstimator(), positions), run(GapEstimator(), positions)
+    first, second = run(GapEstimator(EXACT), positions), run(GapEstimator(EXACT), positions)
     assert [repr(e) for e in first] == [repr(e) for e in second]
 
 
@@ -263,7 +267,7 @@ def stamp_of(k: int) -> int:
 @pytest.mark.parametrize(("moved", "turned"), [(0.6e-3, 0.0), (0.0, 3e-3)])
 def test_leg_body_that_moves_ends_the_track(moved: float, turned: float) -> None:
     """3 mrad about a body 0.2 m away are 0.6 mm at the lens, though the body itself stays where it is."""
-    estimator = GapEstimator(EstimatorParameters(leg_motion=0.5e-3))
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3))
     estimates = run_with_leg(
         estimator,
         list(np.linspace(0.0, 0.006, 40)),
@@ -281,9 +285,11 @@ def test_leg_body_that_moves_ends_the_track(moved: float, turned: float) -> None
 def test_leg_body_at_rest_changes_nothing() -> None:
     positions = list(np.linspace(0.0, 0.006, 40))
     watched = run_with_leg(
-        GapEstimator(EstimatorParameters(leg_motion=0.5e-3)), positions, lambda k: leg(stamp_of(k))
+        GapEstimator(EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3)),
+        positions,
+        lambda k: leg(stamp_of(k)),
     )
-    unwatched = run(GapEstimator(), positions)
+    unwatched = run(GapEstimator(EXACT), positions)
     assert [repr(e) for e in watched] == [repr(e) for e in unwatched]
 
 
@@ -295,13 +301,15 @@ def test_leg_body_that_is_lost_or_elsewhere_is_told() -> None:
         (lambda k: None, "no pose of the leg body"),
         (lambda k: leg(stamp_of(k), frame_id="tibia"), "is given in tibia"),
     ):
-        last = run_with_leg(GapEstimator(EstimatorParameters(leg_motion=0.5e-3)), positions, leg_at)[-1]
+        last = run_with_leg(
+            GapEstimator(EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3)), positions, leg_at
+        )[-1]
         assert last.status is GapStatus.TRACKING_LOST
         assert words in last.reason
 
 
 def test_image_that_comes_long_after_its_poses_gives_no_number() -> None:
-    estimator = GapEstimator(EstimatorParameters(max_delay=0.2))
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE, max_delay=0.2))
     positions = list(np.linspace(0.0, 0.006, 60))
     run(estimator, positions[:50])
     assert estimator.latest is not None
@@ -320,7 +328,7 @@ def test_image_that_comes_long_after_its_poses_gives_no_number() -> None:
 
 def test_backlog_of_poses_and_images_alike_gives_no_number() -> None:
     """Both lay in the node's queue: by their stamps alone neither is later than the other."""
-    estimator = GapEstimator(EstimatorParameters(max_delay=0.2))
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE, max_delay=0.2))
     positions = list(np.linspace(0.0, 0.006, 60))
     run(estimator, positions[:50])
     late = []
@@ -334,14 +342,15 @@ def test_backlog_of_poses_and_images_alike_gives_no_number() -> None:
 
 
 def test_pose_without_an_error_is_refused() -> None:
-    estimator = GapEstimator()
+    estimator = GapEstimator(EXACT)
     estimator.add_pose(replace(pose(10**9, 0.0), covariance=np.zeros((6, 6))), 10**9)
     assert estimator.counts[f"pose refused: {PoseRefusal.NO_ERROR.value}"] == 1
 
 
 def test_gap_beyond_any_joint_is_no_number() -> None:
     estimates = run(
-        GapEstimator(EstimatorParameters(largest_gap=0.8 * TRUE_GAP)), list(np.linspace(0, 0.006, 60))
+        GapEstimator(EstimatorParameters(**EXACT_SCOPE, largest_gap=0.8 * TRUE_GAP)),
+        list(np.linspace(0, 0.006, 60)),
     )
     assert not [e for e in estimates if e.status is GapStatus.VALID]
     assert estimates[-1].status is GapStatus.UNKNOWN

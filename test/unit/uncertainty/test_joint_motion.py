@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.joint_motion import FEWEST_CONTRADICTIONS, LARGEST_SHIFT, Finding, JointMotionTest
 from knee_gap_uncertainty.joint_motion_table import follow, main, selected
@@ -16,6 +17,8 @@ from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.simulated_motion import Situation, simulate
 from knee_gap_uncertainty.views import Views
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 MS = 1_000_000
@@ -83,7 +86,7 @@ def test_edge_that_jumps_is_refused_at_once_and_misses_nothing(
 ) -> None:
     count, at = 80, 40
     estimates = observe(
-        GapEstimator(),
+        GapEstimator(EXACT),
         straight(count, speed),
         jump(count, slice(at, at + length), 3.0, towards_deg),
         np.random.default_rng(5),
@@ -106,7 +109,7 @@ def test_track_that_begins_with_a_bad_edge_publishes_nothing_wrong(
 ) -> None:
     count = 40
     estimates = observe(
-        GapEstimator(),
+        GapEstimator(EXACT),
         straight(count, speed),
         jump(count, slice(0, length), 3.0, towards_deg),
         np.random.default_rng(6),
@@ -116,7 +119,7 @@ def test_track_that_begins_with_a_bad_edge_publishes_nothing_wrong(
 
 def test_single_bad_image_costs_one_image() -> None:
     estimates = observe(
-        GapEstimator(), straight(80, 0.01), jump(80, slice(60, 61), 3.0, 30.0), np.random.default_rng(1)
+        GapEstimator(EXACT), straight(80, 0.01), jump(80, slice(60, 61), 3.0, 30.0), np.random.default_rng(1)
     )
     assert estimates[60].status is GapStatus.UNKNOWN
     assert {e.status for e in estimates[61:]} == {GapStatus.VALID}
@@ -128,7 +131,7 @@ def test_joint_that_moves_ends_the_track_and_the_next_one_is_right() -> None:
     points = np.tile(POINTS, (count, 1, 1))
     points[:, 0] += np.clip((np.arange(count) - at) / 20.0, 0.0, 1.0)[:, None] * moved
     lens, none = straight(count, 0.01), np.zeros((count, 2, 3))
-    estimates = observe(GapEstimator(), lens, none, np.random.default_rng(2), points)
+    estimates = observe(GapEstimator(EXACT), lens, none, np.random.default_rng(2), points)
     ends = [k for k, e in enumerate(estimates) if e.status is GapStatus.JOINT_MOVED]
     assert ends
     assert at < ends[0] <= at + 20

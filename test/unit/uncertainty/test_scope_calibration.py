@@ -8,11 +8,14 @@ from scipy.spatial.transform import Rotation
 from travelling_scope import NOTHING, Array, camera_errors, estimates, scope, spread, told
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapStatus
 from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration, contradiction
 from knee_gap_uncertainty.views import bearing_covariances
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 
 @pytest.mark.parametrize("axis", range(7))
@@ -89,7 +92,7 @@ def test_a_covariance_that_was_rounded_in_a_file_is_one() -> None:
 
 
 def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
-    estimator, views = GapEstimator(), scope(2, 0.0)
+    estimator, views = GapEstimator(EXACT), scope(2, 0.0)
     assert views.lens_rotations is not None
     rotation = views.lens_rotations[0]
     bearings = views.bearings[0] @ rotation

@@ -9,12 +9,15 @@ from scipy.spatial.transform import Rotation
 from travelling_scope import POINTS, Array, estimates, observed, scope, spread, told
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration import CalibrationError
 from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns, TurnRefusal
 from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 SHIFT = np.diag([1e-6, 1e-6, 0, 0, 0, 0])
 
@@ -120,7 +123,7 @@ def turned_estimates(
     turn_at: Callable[[int], float | None], *, followed: bool = False, late: bool = False, shift: int = 0
 ) -> tuple[list[GapEstimate], GapEstimator]:
     """What the estimator says of 40 views, a turn told with each where `turn_at` has one; `late`: last."""
-    estimator, views, found = GapEstimator(), scope(40, 0.0), []
+    estimator, views, found = GapEstimator(EXACT), scope(40, 0.0), []
     estimator.add_calibration(replace(told("tracking_node", "a" * 64, error=SHIFT), turn_followed=followed))
     for k in range(40):
         stamp_ns = 10**18 + k * 10_000_000

@@ -5,12 +5,15 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.multi_view import fit
 from knee_gap_uncertainty.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration
 from knee_gap_uncertainty.scope_turns import ScopeTurn
 from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+
+EXACT = EstimatorParameters(**EXACT_SCOPE)
 
 Array = npt.NDArray[np.float64]
 
@@ -105,7 +108,7 @@ def estimates(
 
     It turns in its camera head by `scope_turn` [rad] on the way.
     """
-    estimator, views, found = GapEstimator(), scope(40, turning), []
+    estimator, views, found = GapEstimator(EXACT), scope(40, turning), []
     errors = camera * camera_errors(views, 0, 1, 2)
     for calibration in calibrations:
         estimator.add_calibration(calibration)

@@ -1,0 +1,416 @@
+"""The instrument gap: how thick a straight instrument passes between the two edges of the opening.
+
+In the plane of the section the lens sees the edges at angles -h and +h from the middle of the opening. A line
+of sight along an edge touches the tissue there and is free before it. An instrument whose axis is tilted by t
+against the view comes, on the side of edge k, as far out as
+
+    S = (r + D) sin(q) - R (1 - cos(q)),    q = h + t on side 0, h - t on side 1,
+
+where r is the distance of the tracked point beside the edge, D how much farther the edge lies than it, and R
+the radius of the surface that bulges behind the edge. The gap is S_0 + S_1 at the best tilt within CONE.
+
+The point lies w = r sin(inset) beside the line of sight along its edge. A smooth bone of radius R that
+touches that line leaves it by w over the distance D = sqrt(2 R w); a rim is the end of a flat face at a
+slope, D = w / tan(slope), and has no radius. Which of the shapes that its kind of edge admits the tissue has
+is not known: the estimate is their mean, their deviation is part of the interval, and their extremes are
+part of the bounds.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_uncertainty.compiled import compiled
+from knee_gap_uncertainty.error_cloud import ring_lengths
+from knee_gap_uncertainty.multi_view import MultiViewFit
+from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE
+from knee_gap_uncertainty.vectors import row, vector
+
+Array = npt.NDArray[np.float64]
+
+# Half angle of the cone of directions, about the direction of view, from which the instrument may come.
+CONE = np.radians(10.0)
+TILTS = np.linspace(-CONE, CONE, 21)
+
+# Shapes of the tissue between point and edge: radius [m], 0 for a flat face, and tangent of the face's slope.
+CONTOUR_SHAPES = np.array([[radius, 1.0] for radius in (0.008, 0.012, 0.016, 0.020, 0.025, 0.030)])
+RIM_SHAPES = np.array([[0.0, np.tan(np.radians(slope))] for slope in (25.0, 35.0, 45.0, 60.0, 80.0)])
+ALL_SHAPES = np.concatenate([CONTOUR_SHAPES, RIM_SHAPES])
+# By the kind of edge in knee_gap_msgs/GapEdges.
+SHAPES = {1: RIM_SHAPES, 2: CONTOUR_SHAPES}
+
+# How far [m] a real surface departs from these shapes: ripples, frayed rims, a point beside the section.
+ROUGHNESS = 0.05e-3
+ROUGHNESS_BOUND = 0.12e-3
+
+# Places on the confidence ellipse of the two inverse distances at which its extremes are looked for.
+AROUND = 64
+
+# Angle [rad] by which a tracked point may lie inside the opening before edges and points contradict.
+MOST_INSIDE = 0.01
+LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad]
+
+# Points outside the opening have a positive angle on both sides.
+SIDES = np.array([-1.0, 1.0])
+TINY = 1e-12
+
+
+class Edges(NamedTuple):
+    """Both edges in the frame of the points: bearings (2, 3), deviations (2,) and bound of the error [rad].
+
+    `kinds` (2,) are those of knee_gap_msgs/GapEdges. `bounded` is false where an edge lies in the given
+    direction or farther out.
+    """
+
+    bearings: Array
+    deviations: Array
+    error: float
+    kinds: tuple[int, int]
+    bounded: bool = True
+
+    @property
+    def shapes(self) -> tuple[Array, Array]:
+        """What is admitted between each point and its edge, (n, 2) each."""
+        return admitted_shapes(self.kinds[0]), admitted_shapes(self.kinds[1])
+
+
+class Opening(NamedTuple):
+    """The opening in the plane of the section, as one lens sees it.
+
+    `half` [rad]: half of the angle between the edges; `insets` (2,) [rad]: the angle by which each tracked
+    point lies beyond its edge; `in_plane` (2,): the cosine of the angle by which it lies beside that plane.
+    `view` and `across` (3,): the direction of view through the middle, and from edge 0 to edge 1 across it.
+    """
+
+    half: float
+    insets: Array
+    in_plane: Array
+    view: Array
+    across: Array
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentGap:
+    """The instrument gap with its interval [m], the instrument's axis, and what edges and shapes contribute.
+
+    `point` (3,) lies midway between the edges, `axis` (3,) leads away from the lens. `shares` (2,): parts of
+    the variance that come from the edges and from the shape.
+    """
+
+    gap: float
+    lower: float
+    upper: float
+    point: Array
+    axis: Array
+    shares: Array
+
+
+def admitted_shapes(kind: int) -> Array:
+    """Shapes (n, 2) that the tissue beside an edge of a kind (of knee_gap_msgs/GapEdges) may have."""
+    return np.asarray(SHAPES.get(kind, ALL_SHAPES))
+
+
+def opening_of(points: Array, edges: Array) -> Opening:
+    """The opening between edges (2, 3), with tracked points beside them at bearings `points` (2, 3)."""
+    view = edges[0] + edges[1]
+    view = view / max(float(np.linalg.norm(view)), TINY)
+    across = edges[1] - edges[0]
+    across = across / max(float(np.linalg.norm(across)), TINY)
+    half = float(np.arctan2(edges[1] @ across, edges[1] @ view))
+    forward, aside = points @ view, points @ across * SIDES
+    return Opening(half, np.arctan2(aside, forward) - half, np.hypot(forward, aside), view, across)
+
+
+def flaw_of(opening: Opening) -> str:
+    """Why edges cannot be used with their points, in words; empty if they can."""
+    if not LEAST_HALF < opening.half < MOST_HALF:
+        return "the edges do not enclose an opening"
+    if not (opening.insets > -MOST_INSIDE).all():
+        return "a tracked point lies inside the opening"
+    return ""
+
+
+def instrument_gap(
+    fit: MultiViewFit, lens: Array, opening: Opening, edges: Edges, radius: float
+) -> InstrumentGap:
+    """The instrument gap of the fitted points with the edges that a lens (3,) [m] sees, and its interval.
+
+    `radius`: two-sided normal deviate of the confidence level. The upper end is infinite where the data do
+    not bound it.
+    """
+    rays = fit.points - lens
+    distances = np.linalg.norm(rays, axis=1)
+    ranges = distances * opening.in_plane
+    gap, tilt, shape_deviation = widest(opening.half, ranges, opening.insets, *edges.shapes, TILTS)
+    along = np.zeros((2, 6))
+    along[0, :3], along[1, 3:] = rays / distances[:, None] / distances[:, None] ** 2
+    inverse_covariance = along @ fit.covariance @ along.T
+    lower, upper, variance = _ends(
+        ranges, inverse_covariance, fit.bend.widening * radius, opening, edges, tilt
+    )
+    shape_variance = shape_deviation**2 + 2.0 * ROUGHNESS**2
+    edge_variance = float(np.sum((edges.deviations * _edge_slopes(ranges, opening, edges, tilt)) ** 2))
+    own = radius**2 * (edge_variance + shape_variance)
+    total = variance + edge_variance + shape_variance
+    # The points' errors, the edges' and the shape's are independent of each other.
+    middle = lens + float(ranges.mean()) * opening.view
+    return InstrumentGap(
+        gap=gap,
+        lower=max(gap - float(np.sqrt((gap - lower) ** 2 + own)), 0.0),
+        upper=gap + float(np.sqrt((upper - gap) ** 2 + own)),
+        point=middle,
+        axis=np.cos(tilt) * opening.view + np.sin(tilt) * opening.across,
+        shares=np.array([edge_variance, shape_variance]) / total,
+    )
+
+
+def widest_gap(points: Array, lens: Array, opening: Opening, edges: Edges) -> float:
+    """The instrument gap [m] beside points (2, 3) [m] that a lens (3,) [m] sees, without an interval."""
+    ranges = np.linalg.norm(points - lens, axis=1) * opening.in_plane
+    return float(widest(opening.half, ranges, opening.insets, *edges.shapes, TILTS)[0])
+
+
+def edge_points(lens: Array, points: Array, opening: Opening, edges: Edges) -> Array:
+    """Where the lines of sight along both edges touch the tissue (2, 3) [m], by the mean of the shapes."""
+    ranges = np.linalg.norm(points - lens, axis=1) * opening.in_plane
+    beyond = [mean_farther(float(ranges[n]), float(opening.insets[n]), edges.shapes[n]) for n in range(2)]
+    return np.asarray(lens + (ranges + beyond)[:, None] * edges.bearings)
+
+
+def _ends(
+    ranges: Array, covariance: Array, radius: float, opening: Opening, edges: Edges, tilt: float
+) -> tuple[float, float, float]:
+    """Least and greatest gap [m] over the ellipse of the points' inverse distances, and its variance [m^2].
+
+    `covariance` (2, 2) [1/m^2] is that of the inverse distances, in which errors of motion stereo are close
+    to Gaussian.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    angles = np.linspace(0.0, 2.0 * np.pi, AROUND, endpoint=False)
+    around = np.stack([np.cos(angles), np.sin(angles)])
+    near = 1.0 / ranges[:, None] + root @ around * 0.1
+    spread = np.array([_gap_at(1.0 / column, opening, edges, tilt) for column in near.T])
+    variance = float(np.max((spread - spread.mean()) ** 2)) / 0.1**2
+    inverse = 1.0 / ranges[:, None] + radius * root @ around
+    if not (inverse > 0.0).all():
+        known = inverse[:, (inverse > 0.0).all(axis=0)]
+        found = [_gap_at(1.0 / column, opening, edges, tilt) for column in known.T]
+        return min(found, default=0.0), np.inf, variance
+    found = [_gap_at(1.0 / column, opening, edges, tilt) for column in inverse.T]
+    return min(found), max(found), variance
+
+
+def _gap_at(ranges: Array, opening: Opening, edges: Edges, tilt: float) -> float:
+    return float(at_tilt(opening.half, ranges, opening.insets, *edges.shapes, tilt)[0])
+
+
+def _edge_slopes(ranges: Array, opening: Opening, edges: Edges, tilt: float) -> Array:
+    """Change (2,) of the gap with the direction of either edge [m/rad]."""
+    step = 1e-3
+    slopes = np.zeros(2)
+    for n, angle in enumerate((opening.half + tilt, opening.half - tilt)):
+        ends = [
+            mean_side(ranges[n], angle + sign * step, opening.insets[n] - sign * step, edges.shapes[n])[0]
+            for sign in (1.0, -1.0)
+        ]
+        slopes[n] = (ends[0] - ends[1]) / (2.0 * step)
+    return slopes
+
+
+def worst_case(
+    travel: Array,
+    present: Array,
+    first: Array,
+    opening: Opening,
+    edges: Edges,
+    angular_error: float,
+    image_error: float,
+    shifts: Array,
+    signs: Array,
+) -> tuple[float, float]:
+    """Least and greatest instrument gap [m] that bounded errors of points, edges and shape allow.
+
+    `travel` (3,) [m] leads from the present lens to the first; `present` and `first` (2, 3) are the bearings
+    of the points from there. `angular_error` [rad] bounds each bearing's error, and `image_error` the part of
+    it that the image alone is to blame for, between a point and its edge; `shifts` (m, 3) [m] are the
+    displacements of either lens, and `signs` the rows of (17) and (18) that are admitted, as for the error
+    clouds. Both points are seen from the same two lenses, so they share the displacements. The greatest gap
+    is infinite where a point may lie at infinity; the least is 0 where nothing bounds it from below.
+    """
+    near, far = admitted_ranges(travel, present, first, opening, angular_error, shifts, signs)
+    return bounds_of_gap(near, far, opening, edges, image_error)
+
+
+def admitted_ranges(
+    travel: Array,
+    present: Array,
+    first: Array,
+    opening: Opening,
+    angular_error: float,
+    shifts: Array,
+    signs: Array,
+) -> tuple[Array, Array]:
+    """Least and greatest distance (m, 2) [m] of the points in the plane of the section; as `worst_case`."""
+    near, far = ranges_under_errors(
+        np.ascontiguousarray(travel), present, first, angular_error, shifts, signs
+    )
+    return near * opening.in_plane, far * opening.in_plane
+
+
+def bounds_of_gap(
+    near: Array, far: Array, opening: Opening, edges: Edges, image_error: float
+) -> tuple[float, float]:
+    """Least and greatest instrument gap [m] for the distances of `admitted_ranges`; as `worst_case`."""
+    if not near.size:
+        return 0.0, np.inf
+    narrower = edges.error - image_error
+    lower = least_gap(
+        near,
+        far,
+        opening.half - edges.error,
+        np.maximum(opening.insets + narrower, 0.0),
+        *edges.shapes,
+        TILTS,
+    )
+    upper = greatest_gap(
+        near,
+        far,
+        opening.half + edges.error,
+        np.maximum(opening.insets - narrower, 0.0),
+        *edges.shapes,
+        TILTS,
+    )
+    return max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND
+
+
+@compiled
+def side(distance: float, angle: float, inset: float, radius: float, slope: float) -> float:
+    """How far out [m] an instrument comes on one side, at `angle` between its axis and the edge."""
+    beside = distance * np.sin(max(inset, 0.0))
+    farther = np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
+    return float((distance + farther) * np.sin(angle) - radius * (1.0 - np.cos(angle)))
+
+
+@compiled
+def mean_farther(distance: float, inset: float, shapes: Array) -> float:
+    """How much farther [m] an edge lies than the point beside it, as a mean over the shapes (n, 2)."""
+    total = 0.0
+    for k in range(shapes.shape[0]):
+        beside = distance * np.sin(max(inset, 0.0))
+        radius, slope = shapes[k, 0], shapes[k, 1]
+        total += np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
+    return total / shapes.shape[0]
+
+
+@compiled
+def mean_side(distance: float, angle: float, inset: float, shapes: Array) -> tuple[float, float]:
+    """Mean [m] and variance [m^2] of `side` over the admitted shapes (n, 2)."""
+    total, squares = 0.0, 0.0
+    for k in range(shapes.shape[0]):
+        value = side(distance, angle, inset, shapes[k, 0], shapes[k, 1])
+        total += value
+        squares += value * value
+    mean = total / shapes.shape[0]
+    return mean, max(squares / shapes.shape[0] - mean * mean, 0.0)
+
+
+@compiled
+def side_range(near: float, far: float, angle: float, inset: float, shapes: Array) -> tuple[float, float]:
+    """Least and greatest `side` [m] over the admitted shapes (n, 2) and distances from `near` to `far`."""
+    least, greatest = np.inf, -np.inf
+    for k in range(shapes.shape[0]):
+        for distance in (near, far):
+            # An axis tilted beyond the edge leaves a farther edge less room.
+            if not distance < np.inf:
+                value = np.inf if angle > 0.0 else -np.inf
+            else:
+                value = side(distance, angle, inset, shapes[k, 0], shapes[k, 1])
+            least, greatest = min(least, value), max(greatest, value)
+    return least, greatest
+
+
+@compiled
+def at_tilt(
+    half: float, ranges: Array, insets: Array, shapes_0: Array, shapes_1: Array, tilt: float
+) -> tuple[float, float]:
+    """Gap [m] of an instrument at a tilt [rad], and the variance of the shapes [m^2]."""
+    first, variance_0 = mean_side(ranges[0], half + tilt, insets[0], shapes_0)
+    second, variance_1 = mean_side(ranges[1], half - tilt, insets[1], shapes_1)
+    return first + second, variance_0 + variance_1
+
+
+@compiled
+def widest(
+    half: float, ranges: Array, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
+) -> tuple[float, float, float]:
+    """Largest gap [m] over the tilts, the tilt [rad] that gives it, and the deviation of the shapes there."""
+    best, at, deviation = -np.inf, 0.0, 0.0
+    for k in range(tilts.size):
+        gap, variance = at_tilt(half, ranges, insets, shapes_0, shapes_1, tilts[k])
+        if gap > best:
+            best, at, deviation = gap, tilts[k], np.sqrt(variance)
+    return best, at, deviation
+
+
+@compiled
+def ranges_under_errors(
+    travel: Array, present: Array, first: Array, angular_error: float, shifts: Array, signs: Array
+) -> tuple[Array, Array]:
+    """Least and greatest distance (m, 2) [m] of both points from the present lens.
+
+    A row for each pair of displacements. Empty where an admitted error turns a bearing into the direction of
+    travel.
+    """
+    t = vector(travel)
+    lengths_0, angle_0 = ring_lengths(t, row(present, 0), row(first, 0), angular_error, shifts, signs)
+    lengths_1, angle_1 = ring_lengths(t, row(present, 1), row(first, 1), angular_error, shifts, signs)
+    if not min(angle_0, angle_1) > SMALLEST_ANGLE:
+        return np.empty((0, 2)), np.empty((0, 2))
+    rows = signs.shape[0]
+    pairs = lengths_0.size // rows
+    near, far = np.full((pairs, 2), np.inf), np.zeros((pairs, 2))
+    for pair in range(pairs):
+        for k in range(rows):
+            lengths = (lengths_0[pair * rows + k], lengths_1[pair * rows + k])
+            for n in range(2):
+                near[pair, n] = min(near[pair, n], lengths[n])
+                far[pair, n] = max(far[pair, n], lengths[n])
+    return near, far
+
+
+@compiled
+def least_gap(
+    near: Array, far: Array, half: float, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
+) -> float:
+    """Gap [m] that is free whatever the pair of displacements (m, 2), at the tilt where most is.
+
+    Only within the lines of sight along the edges is tissue known to be absent.
+    """
+    best = 0.0
+    for k in range(tilts.size):
+        if abs(tilts[k]) > max(half, 0.0):
+            continue
+        lower = np.inf
+        for pair in range(near.shape[0]):
+            first = side_range(near[pair, 0], far[pair, 0], half + tilts[k], insets[0], shapes_0)[0]
+            second = side_range(near[pair, 1], far[pair, 1], half - tilts[k], insets[1], shapes_1)[0]
+            lower = min(lower, first + second)
+        best = max(best, lower)
+    return best
+
+
+@compiled
+def greatest_gap(
+    near: Array, far: Array, half: float, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
+) -> float:
+    """Gap [m] that no pair of displacements (m, 2) exceeds, at any tilt."""
+    best = 0.0
+    for k in range(tilts.size):
+        for pair in range(near.shape[0]):
+            first = side_range(near[pair, 0], far[pair, 0], half + tilts[k], insets[0], shapes_0)[1]
+            second = side_range(near[pair, 1], far[pair, 1], half - tilts[k], insets[1], shapes_1)[1]
+            best = max(best, first + second)
+    return best
