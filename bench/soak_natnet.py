@@ -24,6 +24,7 @@ from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, TrackedScene
 
 NAMES = ("scope", "tibia", "clock")
+GROUP = "239.255.42.98"
 WORST_STAMP = 1e-3
 WORST_POSE = 1e-3
 
@@ -44,7 +45,7 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
     if arguments.jumps:
         faults |= {"--freeze-every": 13.0, "--jump-every": 17.0}
     if arguments.multicast:
-        command += ["--multicast", "239.255.42.98"]
+        command += ["--multicast", GROUP]
     return command + [str(part) for fault in faults.items() for part in fault]
 
 
@@ -93,7 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     watch, end, told = Watch(), time.monotonic() + arguments.minutes * 60.0, time.monotonic()
     server = subprocess.Popen(server_command(arguments), stdout=subprocess.DEVNULL)
     try:
-        with NatNetClient(NatNetParameters(command_port=arguments.port)) as client:
+        parameters = NatNetParameters(command_port=arguments.port, multicast_address=GROUP)
+        with NatNetClient(parameters) as client:
             while time.monotonic() < end:
                 for frame in client.poll(0.02):
                     watch.take(frame)

@@ -22,8 +22,10 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "demo = knee_gap_bringup.demo:main",
-            "leg_controller_node = knee_gap_bringup.leg_controller_node:main",
+            "demo = knee_gap_bringup.entry_points:demo",
+            "leg_controller_node = knee_gap_bringup.entry_points:leg_controller_node",
+            "live = knee_gap_bringup.entry_points:live",
+            "replay = knee_gap_bringup.entry_points:replay",
         ],
     },
 )

@@ -18,11 +18,11 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "calibrate = knee_gap_perception.calibration.command:main",
-            "evaluate = knee_gap_perception.evaluate:main",
-            "segmentation_node = knee_gap_perception.segmentation_node:main",
-            "tracker_precision = knee_gap_perception.tracker_precision_command:main",
-            "tracking_node = knee_gap_perception.tracking_node:main",
+            "calibrate = knee_gap_perception.entry_points:calibrate",
+            "evaluate = knee_gap_perception.entry_points:evaluate",
+            "segmentation_node = knee_gap_perception.entry_points:segmentation_node",
+            "tracker_precision = knee_gap_perception.entry_points:tracker_precision",
+            "tracking_node = knee_gap_perception.entry_points:tracking_node",
         ],
     },
 )

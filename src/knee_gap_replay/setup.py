@@ -18,11 +18,11 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "check = knee_gap_replay.check:main",
-            "import_motive = knee_gap_replay.import_motive:main",
-            "play = knee_gap_replay.play_node:main",
-            "process = knee_gap_replay.process:main",
-            "record = knee_gap_replay.record_node:main",
+            "check = knee_gap_replay.entry_points:check",
+            "import_motive = knee_gap_replay.entry_points:import_motive",
+            "play = knee_gap_replay.entry_points:play",
+            "process = knee_gap_replay.entry_points:process",
+            "record = knee_gap_replay.entry_points:record",
         ],
     },
 )

@@ -19,9 +19,9 @@ setup(
     entry_points={
         "knee_gap.gap_truth": ["simulated = knee_gap_simulation.bag_truth:gap_masks"],
         "console_scripts": [
-            "contact_sheet = knee_gap_simulation.contact_sheet:main",
-            "make_bag = knee_gap_simulation.make_bag:main",
-            "natnet_server = knee_gap_simulation.natnet_server_command:main",
+            "contact_sheet = knee_gap_simulation.entry_points:contact_sheet",
+            "make_bag = knee_gap_simulation.entry_points:make_bag",
+            "natnet_server = knee_gap_simulation.entry_points:natnet_server",
         ],
     },
 )

@@ -18,10 +18,10 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "coverage = knee_gap_uncertainty.coverage.command:main",
-            "joint_motion_table = knee_gap_uncertainty.joint_motion_table:main",
-            "study = knee_gap_uncertainty.study.command:main",
-            "uncertainty_node = knee_gap_uncertainty.uncertainty_node:main",
+            "coverage = knee_gap_uncertainty.entry_points:coverage",
+            "joint_motion_table = knee_gap_uncertainty.entry_points:joint_motion_table",
+            "study = knee_gap_uncertainty.entry_points:study",
+            "uncertainty_node = knee_gap_uncertainty.entry_points:uncertainty_node",
         ],
     },
 )

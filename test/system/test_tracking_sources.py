@@ -149,6 +149,7 @@ def test_of_two_servers_one_is_listened_to(tmp_path: Path) -> None:
             processes.start(f"server_{number}", [*server, "--seed", str(number), "--rate", "100"])
         node = [executable("knee_gap_perception", "tracking_node"), *NODE, "-p", "source:=natnet"]
         node += ["-p", "body:=scope", "-p", f"command_port:={ports[0]}", "-p", "local_address:=127.0.0.1"]
+        node += ["-p", f"data_port:={data}"]
         processes.start("tracking_node", node)
         client.listen(PoseWithCovarianceStamped, "scope_pose")
         client.listen(DiagnosticArray, "/diagnostics")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from knee_gap_bringup.comparison import EDGES, GAP, compare
 from knee_gap_bringup.gap_plot import write_gap_plot
+from knee_gap_bringup.launch_plan import DRAIN, NODES
 from knee_gap_bringup.processes import Processes, StartError, executable
 from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_replay.bag import BagReader
@@ -18,11 +19,6 @@ from knee_gap_replay.errors import BagError
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
-NODES = {
-    "segmentation_node": "knee_gap_perception",
-    "tracking_node": "knee_gap_perception",
-    "uncertainty_node": "knee_gap_uncertainty",
-}
 NAMESPACE = "/knee_gap"
 RECORDED = (
     EDGES,
@@ -36,8 +32,6 @@ RECORDING = "gap.mcap"
 START_TIMEOUT = 120.0
 # The longest that segmentation_node lets an image wait for the pose after it [s].
 LONGEST_POSE_WAIT = 0.1
-# Time for the last image to pass through the nodes and into the recording [s].
-DRAIN = 1.0
 
 
 def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) -> Path:
@@ -70,8 +64,9 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
         print(
             f"demo: nodes ready after {time.monotonic() - begin:.1f} s; playing {bag.name} {pace}", flush=True
         )
-        if processes.wait("play") != 0:
-            raise StartError(f"play failed: {processes.last_words('play')}")
+        # A node that dies ends the demo at once, with its exit code.
+        if (code := processes.wait("play", beside=[*NODES, "record"])) != 0:
+            raise StartError(f"play failed: {processes.last_words('play')}", code)
         time.sleep(DRAIN)
         for node in NODES:
             processes.check(node)
@@ -117,7 +112,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run(arguments.bag, arguments.out, arguments.rate)
-    except (BagError, SimulationError, StartError, OSError) as error:
+    except StartError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return error.code
+    except (BagError, SimulationError, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -1,12 +1,29 @@
-"""An example of what a leg controller does with the gap: open until the instrument fits, never on a guess.
+"""An example of what a leg controller does with the instrument gap: open until the instrument fits.
 
-The gap is that of a joint that holds still: so the leg is opened by a step, stopped, and measured anew.
+A gap is measured while the joint holds still. So the leg opens by a step, stops, comes to rest, and the gap
+is measured again, by a track that began at rest. Every estimate is judged by the same rules, at rest and
+inside a step; one that is refused stops the leg at once. What contradicts itself holds the leg until a person
+resets it. Nothing here knows ROS; `Estimate.from_message` reads messages of rclpy and of bags.
 """
 
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
+
+# GapEstimate's constants, for a core without messages; a test compares them.
+STATUS_VALID = 1
+INTERVALS = {0: "worst_case", 1: "paper"}
+NANOSECONDS = 1_000_000_000
+
+# How far in the future a stamp may lie: clocks of two machines that are kept in step [s].
+MOST_AHEAD = 0.05
+# How often `LegControl.on_time` is to be called at least, which ends a step in time [s].
+TICK = 0.02
+# Tracks remembered by the time of their first image; the oldest are forgotten.
+MOST_TRACKS = 4096
+
+ANEW = "the joint has moved since this track began"
 
 
 class Action(StrEnum):
@@ -27,17 +44,37 @@ class Command(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What the controller looks at in a GapEstimate; lengths [m], `age` [s] by its stamp.
+    """What the controller looks at in a GapEstimate.
 
-    `is_blind`: points or lens are not seen, or nothing can be told of them.
+    Lengths [m]; `stamp_ns` of the image [ns] and `age` [s], its distance from the node's clock.
+    `sequence`: the publisher's number of the message, None where the middleware has none.
     """
 
     is_valid: bool
     track_id: int
     age: float
+    gap: float
     gap_min: float
     gap_max: float
-    is_blind: bool = False
+    interval: str = "worst_case"
+    stamp_ns: int = 0
+    sequence: int | None = None
+
+    @classmethod
+    def from_message(cls, message: Any, now_ns: int, sequence: int | None = None) -> Self:
+        """Return what a GapEstimate, of rclpy or of a bag, states when the node's clock is `now_ns`."""
+        stamp_ns = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        return cls(
+            is_valid=message.status == STATUS_VALID,
+            track_id=message.track_id,
+            age=(now_ns - stamp_ns) / NANOSECONDS,
+            gap=message.gap,
+            gap_min=message.gap_min,
+            gap_max=message.gap_max,
+            interval=INTERVALS.get(message.interval, f"number {message.interval}"),
+            stamp_ns=stamp_ns,
+            sequence=sequence,
+        )
 
 
 @dataclass(frozen=True)
@@ -72,9 +109,16 @@ class LegParameters:
     max_age: float = field(
         default=0.5,
         metadata={
-            "description": "age of an estimate, by its stamp, above which the leg is held; a bag that is "
-            "played needs --clock and use_sim_time [s]",
+            "description": "age of an estimate, by its stamp, above which the leg is held, no less than "
+            "max_delay of uncertainty_node; a bag that is played needs --clock and use_sim_time [s]",
             "range": (0.05, 10.0),
+        },
+    )
+    interval: str = field(
+        default="worst_case",
+        metadata={
+            "description": "interval that estimates must have; paper does not always hold the truth",
+            "choices": tuple(INTERVALS.values()),
         },
     )
 
@@ -85,56 +129,220 @@ class LegParameters:
                 f"largest_gap ({self.largest_gap} m) must exceed instrument_diameter "
                 f"({self.instrument_diameter} m)"
             )
+        if self.interval not in INTERVALS.values():
+            raise ValueError(f"interval is '{self.interval}'; it is one of: {', '.join(INTERVALS.values())}")
+
+
+def hold(reason: str) -> Command:
+    """Return the command to hold the leg."""
+    return Command(Action.HOLD, 0.0, reason)
+
+
+def fault_of(estimate: Estimate) -> str:
+    """Why an estimate contradicts itself: it is valid by its status and cannot be; empty if it does not."""
+    if not estimate.is_valid:
+        return ""
+    if estimate.track_id == 0:
+        return "a valid estimate of no track"
+    if not all(isfinite(length) for length in (estimate.gap, estimate.gap_min, estimate.gap_max)):
+        return "a valid estimate without finite numbers"
+    if not 0.0 <= estimate.gap_min <= estimate.gap <= estimate.gap_max:
+        return "a valid estimate outside its own bounds, or with negative ones"
+    return ""
+
+
+def refusal_of(estimate: Estimate, parameters: LegParameters) -> str:
+    """Why nothing may be done on an estimate by itself; empty if it may be acted on."""
+    if fault := fault_of(estimate):
+        return fault
+    if not estimate.is_valid:
+        return "the gap is not known"
+    if not estimate.gap_min > 0.0:
+        return "the gap may be closed"
+    if not -MOST_AHEAD <= estimate.age <= parameters.max_age:
+        return "the estimate is not of now"
+    if estimate.interval != parameters.interval:
+        return f"the interval is {estimate.interval}, not {parameters.interval}"
+    return ""
 
 
 def decide(estimate: Estimate, parameters: LegParameters) -> Command:
-    """Command from one estimate of a joint at rest: its lower bound says whether the instrument fits."""
-    if not estimate.is_valid or not isfinite(estimate.gap_min) or not isfinite(estimate.gap_max):
-        return Command(Action.HOLD, 0.0, "the gap is not known")
-    if not abs(estimate.age) <= parameters.max_age:
-        return Command(Action.HOLD, 0.0, "the estimate is not of now")
+    """Command from one estimate of a joint at rest: its lower bound decides whether the instrument fits."""
+    if refusal := refusal_of(estimate, parameters):
+        return hold(refusal)
     if estimate.gap_min >= parameters.instrument_diameter:
         return Command(Action.PASS, 0.0, "the whole interval exceeds the instrument")
-    if estimate.gap_max >= parameters.largest_gap:
-        return Command(Action.HOLD, 0.0, "the joint may be at its limit")
+    if not _time_to_limit(estimate, parameters) > 0.0:
+        return hold("the joint may be at its limit")
     return Command(Action.OPEN, parameters.opening_rate, "the gap may be smaller than the instrument")
 
 
 class LegControl:
-    """Opens by a step, waits until the leg is at rest, and believes nothing but a track begun after that."""
+    """Opens by a step, waits until the leg is at rest, and acts on nothing but a track that began after that.
+
+    `on_estimate` takes each estimate, `on_time` the time at least every `TICK`, `on_publishers` who publishes
+    the gap; `now` is a time [s] that never runs backwards. A contradiction is kept in `fault`, and the leg
+    held, until `reset`.
+    """
 
     def __init__(self, parameters: LegParameters) -> None:
         self.parameters = parameters
-        # Until when the leg opens, and until when it comes to rest; None where it is at rest.
+        self.fault = ""
+        # Until when the leg opens, on which track, and until when it comes to rest; None where it is at rest.
         self._opens_until: float | None = None
+        self._step_track = 0
         self._rests_from: float | None = None
-        self._latest_track = 0
-        self._spent_track: int | None = None
+        # Since when the leg is at rest, and when the first image of each track was taken.
+        self._at_rest_since = -float("inf")
+        self._first_image: dict[int, float] = {}
+        # The estimate with the latest stamp, and the latest stamp of an estimate of a track.
+        self._latest: Estimate | None = None
+        self._image_ns: int | None = None
+        self._sequence = -1
+        self._heard: float | None = None
+        self._publisher: str | None = None
+        self._publishers: frozenset[str] = frozenset()
 
     def on_estimate(self, estimate: Estimate, now: float) -> Command:
-        """Command at a time `now` [s] that never runs backwards."""
-        self._latest_track = estimate.track_id or self._latest_track
-        if self._opens_until is not None:
-            if now < self._opens_until and not estimate.is_blind:
-                return Command(Action.OPEN, self.parameters.opening_rate, "a step")
-            self._stop(now)
-        if self._rests_from is not None:
-            if now < self._rests_from:
-                return Command(Action.HOLD, 0.0, "the leg comes to rest")
-            self._rests_from, self._spent_track = None, self._latest_track
-            return Command(Action.HOLD, 0.0, "the joint has moved: it is measured anew", measure_anew=True)
-        if estimate.track_id == self._spent_track:
-            return Command(Action.HOLD, 0.0, "the joint has moved since this track began")
+        """Command after an estimate that came `now`."""
+        self._heard = now
+        self._note_track(estimate, now)
+        contradiction = fault_of(estimate) or self._contradiction(estimate)
+        # A statement without a track may be a moment ahead of the image that comes after it.
+        overtaken = self._latest is not None and estimate.stamp_ns < self._latest.stamp_ns
+        if not overtaken:
+            self._latest = estimate
+            self._image_ns = estimate.stamp_ns if estimate.track_id else self._image_ns
+        self._sequence = self._sequence if estimate.sequence is None else estimate.sequence
+        if contradiction:
+            return self.on_fault(contradiction, now)
+        if (waiting := self._while_held(now)) is not None:
+            return waiting
         command = decide(estimate, self.parameters)
+        if overtaken:
+            command = hold("a later statement came before this estimate")
+        if self._opens_until is not None:
+            return self._inside_step(command, estimate, now)
+        if not self._first_image.get(estimate.track_id, float("nan")) >= self._at_rest_since:
+            # Also where no time of a first image is known.
+            command = hold(ANEW) if estimate.is_valid else command
         if command.action is Action.OPEN:
-            self._opens_until = now + self.parameters.opening_step
+            opening = min(self.parameters.opening_step, _time_to_limit(estimate, self.parameters))
+            self._opens_until, self._step_track = now + opening, estimate.track_id
         return command
 
-    def on_silence(self, now: float) -> Command:
-        """Hold the leg: whoever measures the gap is late or dead."""
-        if self._opens_until is not None:
-            self._stop(now)
-        return Command(Action.HOLD, 0.0, "no estimate within the deadline")
+    def on_time(self, now: float) -> Command | None:
+        """Command that the passing of time makes, None if it makes none: the end of a step, and silence."""
+        if self._opens_until is not None and now >= self._opens_until:
+            return self._stop(now, "the step is over")
+        if self._heard is None or now - self._heard > self.parameters.deadline:
+            return self.on_silence(now)
+        return self._while_held(now)
 
-    def _stop(self, now: float) -> None:
+    def on_silence(self, now: float) -> Command:
+        """Hold the leg: the gap is late, or its node is dead."""
+        if self._opens_until is not None:
+            self._stop(now, "")
+        return self._while_held(now) or hold("no estimate within the deadline")
+
+    def on_publishers(self, publishers: frozenset[str], now: float) -> Command | None:
+        """Command after a look at who publishes the gap: it must be one, and the same until a reset."""
+        self._publishers = publishers
+        if len(publishers) > 1:
+            return self.on_fault(f"{len(publishers)} nodes publish the gap", now)
+        for publisher in publishers:
+            if self._publisher not in (None, publisher):
+                return self.on_fault("another node publishes the gap now", now)
+            self._publisher = publisher
+        return None
+
+    def on_fault(self, fault: str, now: float) -> Command:
+        """Hold the leg until `reset`; of several faults the first is kept."""
+        if self._opens_until is not None:
+            self._stop(now, "")
+        self.fault = self.fault or fault
+        return self._while_held(now) or hold(self.fault)
+
+    def reset(self, now: float) -> str:
+        """Forget a fault, as a person asked; return why that is not possible yet, empty if it was.
+
+        The leg is taken to have moved: the gap is measured again before anything is done.
+        """
+        if len(self._publishers) > 1:
+            return f"{len(self._publishers)} nodes publish the gap; end all but one first"
+        self.fault = ""
+        self._publisher = next(iter(self._publishers), None)
+        self._latest = self._image_ns = None
+        self._sequence = -1
+        self._stop(now, "")
+        return ""
+
+    def _inside_step(self, command: Command, estimate: Estimate, now: float) -> Command:
+        assert self._opens_until is not None
+        if command.action is not Action.OPEN:
+            return self._stop(now, command.reason)
+        if estimate.track_id != self._step_track:
+            return self._stop(now, "another track")
+        if now >= self._opens_until:
+            return self._stop(now, "the step is over")
+        # As the joint opens the limit comes nearer.
+        self._opens_until = min(self._opens_until, now + _time_to_limit(estimate, self.parameters))
+        return command._replace(reason="a step")
+
+    def _while_held(self, now: float) -> Command | None:
+        """Command while a fault or the leg's coming to rest decides, None if neither does."""
+        if self.fault:
+            return hold(f"{self.fault}: held until a person resets it")
+        if self._rests_from is None:
+            return None
+        if now < self._rests_from:
+            return hold("the leg comes to rest")
+        self._at_rest_since, self._rests_from = self._rests_from, None
+        return hold("the joint has moved: the gap is measured again")._replace(measure_anew=True)
+
+    def _note_track(self, estimate: Estimate, now: float) -> None:
+        """Remember when the first image of a track was taken, as far as it was heard of."""
+        if estimate.track_id and estimate.track_id not in self._first_image:
+            if len(self._first_image) >= MOST_TRACKS:
+                del self._first_image[next(iter(self._first_image))]
+            # A stamp in the future makes no track newer.
+            self._first_image[estimate.track_id] = now - max(estimate.age, 0.0)
+
+    def _contradiction(self, estimate: Estimate) -> str:
+        """How an estimate contradicts those before it; empty if it does not."""
+        latest = self._latest
+        if estimate.sequence is not None and estimate.sequence <= (
+            -1 if self._sequence is None else self._sequence
+        ):
+            return "messages of more than one publisher"
+        if latest is None:
+            return ""
+        if estimate.stamp_ns == latest.stamp_ns:
+            # Two statements without a track claim nothing that could differ.
+            differ = latest.track_id or estimate.track_id or latest.is_valid or estimate.is_valid
+            return "two messages of one stamp differ" if differ and not _agree(estimate, latest) else ""
+        back = (latest.stamp_ns - estimate.stamp_ns) / NANOSECONDS
+        behind_image = self._image_ns is not None and estimate.stamp_ns < self._image_ns
+        return "the stamps run backwards" if behind_image or back > self.parameters.max_age else ""
+
+    def _stop(self, now: float, reason: str) -> Command:
         self._opens_until, self._rests_from = None, now + self.parameters.settling
+        return hold(reason)
+
+
+def _time_to_limit(estimate: Estimate, parameters: LegParameters) -> float:
+    """How long the joint may open until it may be at its limit [s]; infinite for a leg that does not move."""
+    room = parameters.largest_gap - estimate.gap_max
+    if room <= 0.0 or parameters.opening_rate > 0.0:
+        return room / max(parameters.opening_rate, 1e-12)
+    return float("inf")
+
+
+def _agree(one: Estimate, other: Estimate) -> bool:
+    """Whether two messages of one stamp state the same; unknown is the same as unknown."""
+    pairs = zip(
+        (one.is_valid, one.track_id, one.interval, one.gap, one.gap_min, one.gap_max),
+        (other.is_valid, other.track_id, other.interval, other.gap, other.gap_min, other.gap_max),
+        strict=True,
+    )
+    return all(a == b or (a != a and b != b) for a, b in pairs)

@@ -1,77 +1,126 @@
 """leg_controller_node: an example subscriber of gap that moves nothing unless the gap is known."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from geometry_msgs.msg import TwistStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from knee_gap_bringup.leg_control import Action, Command, Estimate, LegControl, LegParameters
+from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegControl, LegParameters, hold
 from knee_gap_msgs.msg import GapEstimate
 from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
 
-# What is said where points or lens are not seen; a leg that opens is known to move, and may well go on.
-BLIND = (
-    GapEstimate.STATUS_UNKNOWN,
-    GapEstimate.STATUS_NO_EDGES,
-    GapEstimate.STATUS_TRACKING_LOST,
-    GapEstimate.STATUS_OUT_OF_SYNC,
-)
+# The frame of the command: its x axis is the direction in which the joint opens.
+LEG_FRAME = "leg"
 
 
 class LegControllerNode(BaseNode):
-    """Converts, decides, publishes the rate at which the joint should open [m/s]."""
+    """Converts, decides, publishes the rate at which the joint should open [m/s].
+
+    The command is a TwistStamped, as velocity commands of ROS's controllers are: `linear.x` along the opening
+    of the joint, stamped when it was made, repeated every `TICK`. Hold the leg if none came for 0.1 s.
+    """
 
     def __init__(self) -> None:
         super().__init__("leg_controller_node", health=self.health)
         self._control = LegControl(self.declare(LegParameters))
         self.refuse_unknown_parameters()
-        self._command = Command(Action.HOLD, 0.0, "no estimate received yet")
+        self._command = hold("no estimate received yet")
         self._measure_anew = self.create_client(Trigger, "start_anew")
-        self._rate = self.create_publisher(Float64, "leg/opening_rate", RESULT_QOS)
+        self._rate = self.create_publisher(TwistStamped, "leg/command", RESULT_QOS)
+        self.create_service(Trigger, "~/reset", self.on_reset)
         qos = QoSProfile(
-            depth=1,
+            # Deep enough that no message inside a step is skipped for a newer one.
+            depth=RESULT_QOS.depth,
             reliability=RESULT_QOS.reliability,
             deadline=Duration(nanoseconds=int(self._control.parameters.deadline * 1e9)),
         )
-        self.create_subscription(
+        self._subscription = self.create_subscription(
             GapEstimate,
             "gap",
             self.on_gap,
             qos,
             event_callbacks=SubscriptionEventCallbacks(deadline=self.on_silence),
         )
+        # By the steady clock: a bag's clock that stops must not keep the leg moving.
+        self._tick = self.create_timer(TICK, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def on_gap(self, message: GapEstimate) -> None:
+    def on_gap(self, message: GapEstimate, info: Mapping[str, int | None]) -> None:
         """Decide on one estimate."""
-        valid = message.status == GapEstimate.STATUS_VALID
-        # Not by rclpy's Time, which raises at a stamp before 1970.
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        age = (self.get_clock().now().nanoseconds - stamp_ns) / 1e9
-        blind = message.status in BLIND
-        estimate = Estimate(valid, message.track_id, age, message.gap_min, message.gap_max, blind)
-        self.command(self._control.on_estimate(estimate, time.monotonic()))
+
+        def decide() -> Command:
+            sequence = info.get("publication_sequence_number")
+            estimate = Estimate.from_message(message, self.get_clock().now().nanoseconds, sequence)
+            decided = self._control.on_estimate(estimate, time.monotonic())
+            return self._control.on_publishers(self.publishers(), time.monotonic()) or decided
+
+        self.command(decide)
 
     def on_silence(self, _event: object) -> None:
-        """Hold the leg: whoever measures the gap is late or dead."""
-        self.command(self._control.on_silence(time.monotonic()))
+        """Hold the leg: the gap is late, or its node is dead."""
+        self.command(lambda: self._control.on_silence(time.monotonic()))
 
-    def command(self, command: Command) -> None:
-        """Publish a command, and say so when the action changes."""
-        if command.action is not self._command.action:
-            self.get_logger().info(f"{command.action}: {command.reason}")
-        self._command = command
+    def on_tick(self) -> None:
+        """Let time pass, look who publishes the gap, and repeat the command."""
+
+        def decide() -> Command:
+            fault = self._control.on_publishers(self.publishers(), time.monotonic())
+            return fault or self._control.on_time(time.monotonic()) or self._command
+
+        self.command(decide)
+
+    def on_reset(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        """Forget a fault, as a person asks; the gap is then measured again."""
+        fault = self._control.fault
+        answer.message = self._control.reset(time.monotonic())
+        answer.success = not answer.message
+        if answer.success:
+            answer.message = f"reset after: {fault}" if fault else "there was no fault"
+        self.get_logger().info(answer.message)
+        return answer
+
+    def publishers(self) -> frozenset[str]:
+        """Who publishes the gap, as discovered, by the middleware's ids."""
+        known = self.get_publishers_info_by_topic(self._subscription.topic_name)
+        return frozenset(bytes(one.endpoint_gid).hex() for one in known)
+
+    def command(self, decide: Callable[[], Command]) -> None:
+        """Publish a command, and log it if the action or its reason changes."""
+        try:
+            command = decide()
+        except Exception as error:  # the leg is held whatever went wrong
+            command = self._control.on_fault(f"the controller failed: {error!r}", time.monotonic())
         if command.measure_anew:
-            # Without an answer the leg is held: the old track is not believed any more.
+            # Without an answer the leg is held: the old track is not used any more.
             self._measure_anew.call_async(Trigger.Request())
-        self._rate.publish(Float64(data=command.opening_rate))
+        self.log(command)
+        # A request is made once, however often the command is repeated.
+        self._command = command._replace(measure_anew=False)
+        message = TwistStamped()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = LEG_FRAME
+        message.twist.linear.x = command.opening_rate
+        self._rate.publish(message)
+
+    def log(self, command: Command) -> None:
+        """Log what changes; a fault as an error."""
+        if command.action is self._command.action and (
+            command.reason == self._command.reason or command.action is Action.OPEN
+        ):
+            return
+        words = f"{command.action}: {command.reason}"
+        if self._control.fault:
+            self.get_logger().error(f"{words} (call {self.get_name()}/reset)")
+        elif command.action is not self._command.action:
+            self.get_logger().info(words)
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """The present action and its reason."""
-        return True, f"{self._command.action}: {self._command.reason}", {}
+        return not self._control.fault, f"{self._command.action}: {self._command.reason}", {}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

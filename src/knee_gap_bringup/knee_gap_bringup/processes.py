@@ -11,6 +11,8 @@ from typing import Self
 
 from ament_index_python.packages import get_package_prefix
 
+from knee_gap_bringup.launch_plan import exit_code_of
+
 # What every node logs once it can take messages.
 READY = "ready"
 # Time a process has to end after it was asked to [s].
@@ -18,7 +20,14 @@ GRACE = 10.0
 
 
 class StartError(RuntimeError):
-    """A process did not come up, or ended before its time; the message says which and its last words."""
+    """A process did not come up, or ended before its time; the message says which and its last words.
+
+    `code` is what the whole ends with: the process's own exit code, 1 where it has none or ended with 0.
+    """
+
+    def __init__(self, message: str, code: int = 1) -> None:
+        super().__init__(message)
+        self.code = exit_code_of(code) or 1
 
 
 def executable(package: str, name: str) -> str:
@@ -78,18 +87,23 @@ class Processes:
         """Raise StartError if a process has ended."""
         code = self._running[name].poll()
         if code is not None:
-            raise StartError(f"{name} ended with exit code {code}: {self.last_words(name)}")
+            raise StartError(f"{name} ended with exit code {code}: {self.last_words(name)}", code)
 
     def last_words(self, name: str) -> str:
         """Last line that a process wrote."""
         lines = self.log(name).read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "(it said nothing)"
 
-    def wait(self, name: str) -> int:
-        """Wait until a process ends by itself; return its exit code."""
-        code = self._running[name].wait()
-        del self._running[name]
-        return code
+    def wait(self, name: str, beside: Sequence[str] = ()) -> int:
+        """Wait until a process ends by itself; return its exit code.
+
+        Raises StartError if one of `beside` ends meanwhile.
+        """
+        while self._running[name].poll() is None:
+            for other in beside:
+                self.check(other)
+            time.sleep(0.02)
+        return self._running.pop(name).wait()
 
     def end(self, name: str) -> int:
         """Ask a process to end, kill it if it does not; return its exit code."""

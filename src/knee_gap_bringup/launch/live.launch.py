@@ -1,45 +1,52 @@
 """The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`.
 
 The file says all that a laboratory has to set, whether images come compressed included; config/knee_gap.yaml
-is one to begin with.
+is one to begin with. A node that ends is started again (respawn:=false for none), except for one that refuses
+its settings: that ends the launch with its exit code.
 """
 
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+
+from knee_gap_bringup.launch_actions import actions, refuse
+from knee_gap_bringup.launch_plan import RESPAWN_DELAY, live_plan, live_problem
 
 SHARE = Path(get_package_share_directory("knee_gap_bringup"))
 CONFIG = SHARE / "config"
 TRANSPORT = SHARE / "launch" / "transport.launch.py"
-NODES = {
-    "segmentation_node": "knee_gap_perception",
-    "tracking_node": "knee_gap_perception",
-    "uncertainty_node": "knee_gap_uncertainty",
-}
+
+
+def start(context: object) -> list[object]:
+    """Three nodes in one namespace, with one parameter file."""
+    params, namespace, respawn, delay = (
+        LaunchConfiguration(name).perform(context)
+        for name in ("params", "namespace", "respawn", "respawn_delay")
+    )
+    refuse(live_problem(params, delay))
+    return actions(live_plan(params, namespace, respawn=respawn == "true"), float(delay))
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Three nodes in one namespace, with one parameter file."""
+    """Arguments and what they start."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("params", default_value=str(CONFIG / "knee_gap.yaml")),
             DeclareLaunchArgument("namespace", default_value="knee_gap"),
-            IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
-            *(
-                Node(
-                    package=package,
-                    executable=name,
-                    name=name,
-                    namespace=LaunchConfiguration("namespace"),
-                    parameters=[LaunchConfiguration("params")],
-                    output="screen",
-                )
-                for name, package in NODES.items()
+            DeclareLaunchArgument(
+                "respawn",
+                default_value="true",
+                choices=["true", "false"],
+                description="start a node that ended again",
             ),
+            DeclareLaunchArgument(
+                "respawn_delay", default_value=str(RESPAWN_DELAY), description="pause before that [s]"
+            ),
+            IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
+            OpaqueFunction(function=start),
         ]
     )

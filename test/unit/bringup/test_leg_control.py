@@ -2,29 +2,165 @@
 
 import math
 
+import fuzz_leg_control
 import pytest
 
-from knee_gap_bringup.leg_control import Action, Estimate, LegControl, LegParameters, decide
+from knee_gap_bringup.leg_control import (
+    INTERVALS,
+    MOST_TRACKS,
+    STATUS_VALID,
+    Action,
+    Estimate,
+    LegControl,
+    LegParameters,
+    decide,
+)
 
 PARAMETERS = LegParameters(instrument_diameter=0.004, largest_gap=0.012)
-NARROW = Estimate(is_valid=True, track_id=1, age=0.05, gap_min=0.0039, gap_max=0.006)
+NARROW = Estimate(is_valid=True, track_id=1, age=0.05, gap=0.005, gap_min=0.0039, gap_max=0.006)
 WIDE = NARROW._replace(gap_min=0.0045)
+LOST = NARROW._replace(is_valid=False, track_id=0, gap=math.nan, gap_min=math.nan, gap_max=math.nan)
+
+# Valid by their status, and impossible.
+FAULTY = {
+    "no gap": NARROW._replace(gap=math.nan),
+    "no lower bound": NARROW._replace(gap_min=math.nan),
+    "no upper bound": NARROW._replace(gap_max=math.nan),
+    "infinite": NARROW._replace(gap_max=math.inf),
+    "negative": NARROW._replace(gap_min=-0.001),
+    "below its bounds": NARROW._replace(gap=0.003),
+    "above its bounds": NARROW._replace(gap=0.007),
+    "bounds exchanged": NARROW._replace(gap_min=0.006, gap_max=0.0039),
+    "fits, bounds exchanged": NARROW._replace(gap_min=0.006, gap_max=0.005, gap=0.0055),
+    "no track": NARROW._replace(track_id=0),
+}
+# Possible, and nothing to act on.
+REFUSED = {
+    "not valid": NARROW._replace(is_valid=False),
+    "lost": LOST,
+    "all zero": NARROW._replace(gap=0.0, gap_min=0.0, gap_max=0.0),
+    "perhaps closed": NARROW._replace(gap_min=0.0),
+    "old": NARROW._replace(age=0.6),
+    "0.4 s in the future": NARROW._replace(age=-0.4),
+    "51 ms in the future": NARROW._replace(age=-0.051),
+    "of no time": NARROW._replace(age=math.nan),
+    "as published": NARROW._replace(interval="paper"),
+    "at the limit": NARROW._replace(gap_max=0.012),
+    "beyond the limit": NARROW._replace(gap_max=0.013),
+}
+
+
+def images(*estimates):
+    """The same, as images one after the other."""
+    return [estimate._replace(stamp_ns=1 + index) for index, estimate in enumerate(estimates)]
+
+
+@pytest.mark.parametrize("estimate", [*FAULTY.values(), *REFUSED.values()], ids=[*FAULTY, *REFUSED])
+def test_holds_on_what_the_rules_refuse(estimate) -> None:
+    command = decide(estimate, PARAMETERS)
+    assert command.action is Action.HOLD
+    assert command.opening_rate == 0.0
+    assert LegControl(PARAMETERS).on_estimate(estimate, 10.0).action is Action.HOLD
+
+
+@pytest.mark.parametrize("estimate", [*FAULTY.values(), *REFUSED.values()], ids=[*FAULTY, *REFUSED])
+def test_inside_a_step_the_same_rules_stop_it_at_once(estimate) -> None:
+    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    first, bad, good = images(NARROW, estimate, NARROW)
+    assert control.on_estimate(first, 10.0).opening_rate > 0.0
+    assert control.on_estimate(bad, 10.1).opening_rate == 0.0
+    assert control.on_estimate(good, 10.2).opening_rate == 0.0
+
+
+@pytest.mark.parametrize("estimate", FAULTY.values(), ids=FAULTY)
+def test_what_contradicts_itself_holds_the_leg_until_a_person_resets_it(estimate) -> None:
+    control = LegControl(LegParameters(settling=0.3))
+    bad, *good = images(estimate, *[NARROW._replace(track_id=9)] * 4)
+    control.on_estimate(bad, 10.0)
+    assert control.fault
+    assert "until a person resets it" in control.on_estimate(good[0], 10.5).reason
+    assert control.reset(11.0) == ""
+    assert control.on_estimate(good[1], 11.1).action is Action.HOLD
+    assert control.on_estimate(good[2], 11.4).measure_anew
+    assert control.on_estimate(good[3]._replace(track_id=10), 11.5).action is Action.OPEN
+
+
+@pytest.mark.parametrize("estimate", REFUSED.values(), ids=REFUSED)
+def test_what_is_merely_refused_needs_no_person(estimate) -> None:
+    control = LegControl(PARAMETERS)
+    refused, good = images(estimate, NARROW)
+    assert control.on_estimate(refused, 10.0).action is Action.HOLD
+    assert not control.fault
+    if estimate.track_id and not math.isnan(estimate.age):
+        assert control.on_estimate(good, 10.1).action is Action.OPEN
 
 
 @pytest.mark.parametrize(
-    ("valid", "gap_min", "gap_max"),
+    "second",
     [
-        (False, 0.005, 0.006),
-        (True, math.nan, 0.006),
-        (True, 0.003, math.nan),
-        (True, 0.003, math.inf),
-        (True, 0.003, 0.013),
+        NARROW._replace(gap_max=0.0061),
+        NARROW._replace(track_id=2),
+        LOST,
+        NARROW._replace(stamp_ns=-1),
+        LOST._replace(stamp_ns=-1),
     ],
+    ids=["other bounds", "another track", "lost and valid at once", "time back", "lost in the past"],
 )
-def test_holds_on_what_is_not_known_or_at_the_limit(valid: bool, gap_min: float, gap_max: float) -> None:
-    command = decide(Estimate(valid, 1, 0.05, gap_min, gap_max), PARAMETERS)
-    assert command.action is Action.HOLD
-    assert command.opening_rate == 0.0
+def test_messages_that_contradict_each_other_hold_the_leg(second) -> None:
+    control = LegControl(PARAMETERS)
+    assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
+    assert control.on_estimate(second, 10.1).action is Action.HOLD
+    assert control.fault
+
+
+def test_the_same_message_again_is_no_contradiction() -> None:
+    control = LegControl(PARAMETERS)
+    for estimate in (NARROW, LOST._replace(stamp_ns=2)):
+        control.on_estimate(estimate, 10.0)
+        control.on_estimate(estimate, 10.1)
+    assert not control.fault
+
+
+def test_an_image_behind_a_statement_of_silence_waits_and_needs_no_person() -> None:
+    control = LegControl(PARAMETERS)
+    control.on_estimate(LOST._replace(stamp_ns=100_000_000), 10.0)
+    assert control.on_estimate(NARROW._replace(stamp_ns=90_000_000), 10.0).action is Action.HOLD
+    assert control.on_estimate(NARROW._replace(stamp_ns=110_000_000), 10.1).action is Action.OPEN
+    control.on_estimate(LOST._replace(stamp_ns=9_000_000_000), 10.2)
+    control.on_estimate(NARROW._replace(stamp_ns=120_000_000), 10.3)
+    assert "backwards" in control.fault
+
+
+def test_a_second_publisher_holds_the_leg_as_long_as_it_is_there() -> None:
+    control = LegControl(PARAMETERS)
+    assert control.on_publishers(frozenset({"a"}), 10.0) is None
+    assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
+    assert control.on_publishers(frozenset({"a", "b"}), 10.1).action is Action.HOLD
+    assert "2 nodes publish the gap" in control.reset(10.2)
+    assert control.fault
+    control.on_publishers(frozenset({"b"}), 10.3)
+    assert control.reset(10.4) == ""
+    assert control.on_publishers(frozenset({"b"}), 10.5) is None
+    assert control.on_publishers(frozenset(), 10.6) is None
+    # A node that took its place is another one, though they never met.
+    assert control.on_publishers(frozenset({"c"}), 10.7).action is Action.HOLD
+    assert control.fault
+
+
+def test_numbers_of_two_publishers_are_found_before_their_names_are() -> None:
+    control = LegControl(PARAMETERS)
+    ours, others, again = images(*[NARROW] * 3)
+    assert control.on_estimate(ours._replace(sequence=70), 10.0).action is Action.OPEN
+    assert control.on_estimate(others._replace(sequence=3), 10.1).action is Action.HOLD
+    assert control.on_estimate(again._replace(sequence=71), 10.1).action is Action.HOLD
+    assert "more than one publisher" in control.fault
+
+
+def test_a_fault_of_the_controller_itself_holds_the_leg() -> None:
+    control = LegControl(PARAMETERS)
+    assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
+    assert control.on_fault("something failed", 10.1).opening_rate == 0.0
+    assert control.on_estimate(NARROW._replace(stamp_ns=9, track_id=9), 20.0).action is Action.HOLD
 
 
 def test_opens_while_the_lower_bound_is_too_small() -> None:
@@ -37,58 +173,149 @@ def test_passes_on_the_lower_bound_not_on_the_estimate() -> None:
     assert decide(NARROW._replace(gap_min=0.004, gap_max=0.02), PARAMETERS).action is Action.PASS
 
 
-@pytest.mark.parametrize("age", [0.6, -0.6, math.nan])
-def test_holds_on_an_estimate_that_is_not_of_now(age: float) -> None:
-    command = decide(NARROW._replace(age=age), PARAMETERS)
-    assert command.action is Action.HOLD
-    assert command.opening_rate == 0.0
+def test_the_published_interval_can_be_asked_for() -> None:
+    paper = LegParameters(interval="paper")
+    assert decide(NARROW._replace(interval="paper"), paper).action is Action.OPEN
+    assert decide(NARROW, paper).action is Action.HOLD
 
 
-def test_settings_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(ValueError, match="must exceed instrument_diameter"):
-        LegParameters(instrument_diameter=0.013, largest_gap=0.012)
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"instrument_diameter": 0.013, "largest_gap": 0.012}, "must exceed instrument_diameter"),
+        ({"interval": "best"}, "one of: worst_case, paper"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(settings, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        LegParameters(**settings)
 
 
-def test_opens_by_a_step_and_believes_only_a_track_begun_at_rest() -> None:
+def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
     control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
-    assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
-    # While the joint moves nothing that is measured counts, not even that the instrument fits.
-    assert control.on_estimate(WIDE, 0.4).action is Action.OPEN
-    assert control.on_estimate(WIDE, 0.5).action is Action.HOLD
-    during = WIDE._replace(track_id=2)
+    first, moving, over, during, at_rest, later, late, anew, open_again = images(
+        NARROW,
+        NARROW,
+        NARROW,
+        *[WIDE._replace(track_id=2)] * 4,
+        WIDE._replace(track_id=3),
+        NARROW._replace(track_id=3),
+    )
+    assert control.on_estimate(first, 0.0).action is Action.OPEN
+    assert control.on_estimate(moving, 0.4).action is Action.OPEN
+    assert control.on_estimate(over, 0.5).action is Action.HOLD
     assert control.on_estimate(during, 0.7).action is Action.HOLD
-    at_rest = control.on_estimate(during, 0.85)
-    assert at_rest.action is Action.HOLD
-    assert at_rest.measure_anew
-    assert control.on_estimate(during, 1.0).action is Action.HOLD
-    assert not control.on_estimate(during, 1.1).measure_anew
-    anew = WIDE._replace(track_id=3)
+    resting = control.on_estimate(at_rest, 0.85)
+    assert resting.action is Action.HOLD
+    assert resting.measure_anew
+    assert control.on_estimate(later, 1.0).action is Action.HOLD
+    assert not control.on_estimate(late, 1.1).measure_anew
     assert control.on_estimate(anew, 2.0).action is Action.PASS
-    assert control.on_estimate(NARROW._replace(track_id=3), 2.1).action is Action.OPEN
+    assert control.on_estimate(open_again, 2.1).action is Action.OPEN
+
+
+def test_while_the_joint_moves_not_even_that_the_instrument_fits_counts() -> None:
+    control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
+    first, fits = images(NARROW, WIDE)
+    assert control.on_estimate(first, 0.0).action is Action.OPEN
+    assert control.on_estimate(fits, 0.1).action is Action.HOLD
+
+
+def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_came_after() -> None:
+    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
+    assert control.on_time(0.1).action is Action.HOLD
+    assert control.on_time(0.45).measure_anew
+    late, fresh = images(NARROW, NARROW._replace(track_id=2, age=0.2))[1:], NARROW._replace(track_id=3)
+    assert control.on_estimate(late[0], 0.55).action is Action.HOLD
+    assert control.on_estimate(late[0]._replace(stamp_ns=3), 0.6).action is Action.HOLD
+    assert control.on_estimate(fresh._replace(stamp_ns=4), 0.7).action is Action.OPEN
+
+
+def test_time_alone_ends_a_step() -> None:
+    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
+    assert control.on_time(0.09) is None
+    assert control.on_time(0.1).opening_rate == 0.0
+
+
+def test_a_step_is_shorter_where_the_limit_is_nearer() -> None:
+    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    assert control.on_estimate(NARROW._replace(gap_max=0.0119), 0.0).action is Action.OPEN
+    assert control.on_time(0.099) is None
+    assert control.on_time(0.101).opening_rate == 0.0
+
+
+def test_a_leg_that_does_not_move_needs_no_time_to_its_limit() -> None:
+    assert decide(NARROW, LegParameters(opening_rate=0.0)).action is Action.OPEN
+    assert decide(REFUSED["at the limit"], LegParameters(opening_rate=0.0)).action is Action.HOLD
 
 
 def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
     control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
-    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
-    assert control.on_silence(0.2).opening_rate == 0.0
-    assert control.on_estimate(NARROW, 0.3).action is Action.HOLD
-    assert control.on_estimate(NARROW, 0.6).measure_anew
-    assert control.on_estimate(NARROW, 0.7).action is Action.HOLD
-
-
-def test_a_step_ends_where_nothing_is_seen_any_more() -> None:
-    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
-    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
-    moved = NARROW._replace(is_valid=False)
-    assert control.on_estimate(moved, 0.1).opening_rate > 0.0
-    assert control.on_estimate(moved._replace(is_blind=True), 0.2).opening_rate == 0.0
-    assert control.on_estimate(NARROW, 0.3).action is Action.HOLD
+    first, *after = images(*[NARROW] * 4)
+    assert control.on_estimate(first, 0.0).opening_rate > 0.0
+    assert control.on_time(0.19) is None
+    assert control.on_time(0.21).opening_rate == 0.0
+    assert control.on_estimate(after[0], 0.3).action is Action.HOLD
+    assert control.on_estimate(after[1], 0.6).measure_anew
+    assert control.on_estimate(after[2], 0.7).action is Action.HOLD
 
 
 def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
     control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
-    assert control.on_estimate(NARROW, 0.0).opening_rate > 0.0
-    assert control.on_estimate(NARROW, 0.1).action is Action.HOLD
-    silent = NARROW._replace(is_valid=False, track_id=0, is_blind=True)
+    first, over, silent, old = images(NARROW, NARROW, LOST, NARROW)
+    assert control.on_estimate(first, 0.0).opening_rate > 0.0
+    assert control.on_estimate(over, 0.1).action is Action.HOLD
     assert control.on_estimate(silent, 0.5).measure_anew
-    assert control.on_estimate(NARROW, 0.6).action is Action.HOLD
+    assert control.on_estimate(old, 0.6).action is Action.HOLD
+
+
+def test_memory_is_bounded_however_many_tracks_come() -> None:
+    control = LegControl(PARAMETERS)
+    for number in range(1, 3 * MOST_TRACKS):
+        control.on_estimate(
+            NARROW._replace(track_id=number, stamp_ns=number, is_valid=False), 10.0 + 0.001 * number
+        )
+    assert len(control._first_image) <= MOST_TRACKS
+
+
+def test_a_message_of_ros_or_of_a_bag_becomes_an_estimate() -> None:
+    messages = pytest.importorskip("knee_gap_msgs.msg")
+    message = messages.GapEstimate(status=messages.GapEstimate.STATUS_VALID, track_id=7, gap=0.005)
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 500_000_000
+    estimate = Estimate.from_message(message, 12_700_000_000, sequence=3)
+    assert estimate.is_valid
+    assert estimate.age == pytest.approx(0.2)
+    assert (estimate.track_id, estimate.gap, estimate.sequence) == (7, 0.005, 3)
+    assert estimate.interval == "worst_case"
+    assert messages.GapEstimate.STATUS_VALID == STATUS_VALID
+    named = {"worst_case": messages.GapEstimate.INTERVAL_WORST_CASE}
+    named["paper"] = messages.GapEstimate.INTERVAL_PAPER
+    assert {name: number for number, name in INTERVALS.items()} == named
+
+
+def test_ten_thousand_random_conversations_break_no_rule() -> None:
+    # bench/fuzz_leg_control.py plays a hundred thousand.
+    counts = fuzz_leg_control.run(10_000, seed=1)
+    # It does not hold the leg for ever either.
+    assert counts["open"] > 5_000
+    assert counts["instrument may pass"] > 4_000
+
+
+@pytest.mark.parametrize("rule", ["fault_of", "refusal_of"])
+def test_the_random_conversations_find_a_rule_that_is_missing(rule, monkeypatch) -> None:
+    monkeypatch.setattr(f"knee_gap_bringup.leg_control.{rule}", lambda *_: "")
+    with pytest.raises(AssertionError):
+        fuzz_leg_control.run(2000, seed=2)
+
+
+@pytest.mark.parametrize("method", ["_contradiction", "_note_track", "on_publishers"])
+def test_they_find_a_controller_without_memory(method, monkeypatch) -> None:
+    def forgetful(control, estimate=None, now=0.0):
+        if method == "_note_track":
+            control._first_image = {estimate.track_id: now}
+
+    monkeypatch.setattr(LegControl, method, forgetful)
+    with pytest.raises(AssertionError):
+        fuzz_leg_control.run(2000, seed=3)

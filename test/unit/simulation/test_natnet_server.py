@@ -1,6 +1,8 @@
+import os
 import socket
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,16 +80,63 @@ def test_frames_come_by_unicast_with_the_time_of_exposure(version):
     assert np.median(np.abs(stamp_errors(frames))) < 0.001
 
 
-def test_frames_come_by_multicast_that_the_server_tells():
+def test_frames_come_by_the_multicast_group_that_was_set():
     port = free_port()
+    settings = {"multicast_address": "239.255.42.88", "data_port": port}
     with (
-        Served(multicast_address="239.255.42.88", data_port=port, rate=120.0) as served,
-        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+        Served(rate=120.0, **settings) as served,
+        NatNetClient(NatNetParameters(command_port=served.port, **settings)) as client,
     ):
         frames = collect(client, 1.5)
         if not frames and "cannot be joined" in client.status().words:
             pytest.skip("no multicast on the loopback of this machine")
     assert len(frames) > 100
+
+
+def test_no_group_is_joined_because_the_server_states_it():
+    number = 1 + os.getpid() % 250
+    with (
+        Served(multicast_address=f"239.255.77.{number}", data_port=free_port(), rate=120.0) as served,
+        NatNetClient(NatNetParameters(command_port=served.port, data_port=free_port())) as client,
+    ):
+        frames = collect(client, 1.5)
+        words = client.status().words
+        joined = Path("/proc/net/igmp").read_text() if Path("/proc/net/igmp").exists() else ""
+    assert not frames
+    assert f"Motive sends to 239.255.77.{number}:" in words
+    assert "set multicast_address and data_port" in words
+    # As the kernel writes the group.
+    assert f"{number:02X}4DFFEF" not in joined
+
+
+def test_forged_packets_from_another_port_change_nothing():
+    swapped = packets.Models(bodies=[packets.BodyModel(1, "tibia"), packets.BodyModel(2, "scope")])
+    forged = [
+        packets.model_definitions((4, 1), swapped),
+        packets.server_info((4, 1), frequency=1000, data_port=9, multicast_address="239.1.2.3"),
+        packets.echo_response(bytes(8), 12345),
+        packets.packet(packets.UNRECOGNIZED_REQUEST, b""),
+    ]
+    with (
+        Served(rate=120.0) as served,
+        NatNetClient(NatNetParameters(command_port=served.port)) as client,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as forger,
+    ):
+        frames, sent = collect(client, 1.0), 0
+        for _ in range(20):
+            for data in forged:
+                client.session._models_wanted = True
+                forger.sendto(data, client._command.getsockname())
+                sent += 1
+            frames += collect(client, 0.1)
+        status = client.status()
+    assert status.ok, status.words
+    assert status.values["packets from other ports of the server"] == sent
+    assert len(frames) > 200
+    assert {tuple(sorted(frame.names.items())) for frame in frames} == {
+        ((1, "scope"), (2, "tibia"), (3, "clock"))
+    }
+    assert np.median(np.abs(stamp_errors(frames))) < 0.001
 
 
 def test_poses_are_those_of_the_scene_turned_to_z_up():

@@ -45,12 +45,12 @@ class NatNetParameters:
     )
     multicast_address: str = field(
         default="239.255.42.99",
-        metadata={"description": "Multicast group of the data, where the server does not tell it"},
+        metadata={"description": "Multicast group of the data, as set in Motive; no other is joined"},
     )
     data_port: int = field(
         default=1511,
         metadata={
-            "description": "UDP port of multicast data, where the server does not tell it",
+            "description": "UDP port of multicast data, as set in Motive",
             "range": (1, 65535),
         },
     )
@@ -87,16 +87,24 @@ class NatNetClient:
         self._ros_now = ros_now
         server = _resolved(self.parameters.server_address)
         self._server = (server, self.parameters.command_port)
-        self.session = NatNetSession(server, up_axis=up_axis, max_clock_error=self.parameters.max_clock_error)
+        # No packet chooses what is listened to.
+        self._group = (self.parameters.multicast_address, self.parameters.data_port)
+        self.session = NatNetSession(
+            server,
+            command_port=self.parameters.command_port,
+            group=f"{self._group[0]}:{self._group[1]}",
+            up_axis=up_axis,
+            max_clock_error=self.parameters.max_clock_error,
+        )
         self._local = self.parameters.local_address or _route_to(self._server)
         self._command = _udp_socket((self._local, 0))
         self._data: socket.socket | None = None
-        self._group: tuple[str, int] | None = None
+        self._joined = False
         self._send_fault = ""
         # One thread receives, another asks how it fares.
         self._lock = threading.Lock()
         if self.parameters.transmission == "multicast":
-            self._join((self.parameters.multicast_address, self.parameters.data_port))
+            self._join()
 
     def __enter__(self) -> Self:
         return self
@@ -176,28 +184,22 @@ class NatNetClient:
         return min(readings)[1]
 
     def _follow_transmission(self) -> None:
-        """Listen to the multicast group that the server tells, if it sends that way or does not say how."""
+        """Listen to the multicast group that was set, if the server sends that way or does not say how."""
         info = self.session.info
-        if self.parameters.transmission != "auto" or info is None:
-            return
-        if info.multicast is None:
-            self._join((self.parameters.multicast_address, self.parameters.data_port))
-        elif info.multicast and info.multicast_address and info.data_port:
-            self._join((info.multicast_address, info.data_port))
+        if self.parameters.transmission == "auto" and info is not None and info.multicast is not False:
+            self._join()
 
-    def _join(self, group: tuple[str, int]) -> None:
-        if group == self._group:
+    def _join(self) -> None:
+        if self._joined:
             return
-        self._group = group
-        if self._data is not None:
-            self._data.close()
-            self._data = None
+        self._joined = True
         try:
-            self._data = _udp_socket(group, shared=True)
-            membership = socket.inet_aton(group[0]) + socket.inet_aton(self._local)
+            self._data = _udp_socket(self._group, shared=True)
+            membership = socket.inet_aton(self._group[0]) + socket.inet_aton(self._local)
             self._data.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
         except (OSError, PerceptionError) as error:
-            self._send_fault = f"multicast {group[0]}:{group[1]} cannot be joined: {error}"
+            group = f"{self._group[0]}:{self._group[1]}"
+            self._send_fault = f"multicast {group} cannot be joined: {error}"
 
 
 def _resolved(address: str) -> str:

@@ -14,8 +14,10 @@ RATE_KNOWN_AFTER_NS = 3 * NANOSECONDS
 MAX_AGE_NS = 60 * NANOSECONDS
 # Of fewer echoes, none may have been a quick one.
 FEWEST_ECHOES = 6
-# An echo that is this far outside of what the clock says means another clock: the server restarted [ns].
-RESTART_NS = 2_000_000
+# An echo that is this far outside of what the clock allows is of another clock: it is refused [ns].
+OTHER_CLOCK_NS = 2_000_000
+# So many echoes in a row that are refused, and agree with each other, may mean that the server restarted.
+FEWEST_OF_ANOTHER = 3
 
 
 class Echo(NamedTuple):
@@ -30,7 +32,8 @@ class EchoClock:
     """Maps ticks of the server's clock to the local monotonic clock [ns].
 
     Each echo encloses the moment at which the server read its clock. Echoes that took little longer than the
-    quickest one are kept; a straight line through their middles gives offset and rate.
+    quickest one are kept; a straight line through their middles gives offset and rate. An echo that
+    contradicts the clock is refused; `restart` follows a server that restarted.
     """
 
     def __init__(self, frequency: int, max_error_ns: float = 1_000_000) -> None:
@@ -38,6 +41,8 @@ class EchoClock:
         self.max_error_ns = max_error_ns
         self.restart_count = 0
         self._echoes: deque[Echo] = deque(maxlen=120)
+        # Echoes that were refused since the last one that was not.
+        self._refused: list[Echo] = []
         self._origin: Echo | None = None
         self._ns_per_tick = NANOSECONDS / frequency
         self._error_ns = float("inf")
@@ -52,19 +57,48 @@ class EchoClock:
         enough = len(self._echoes) >= FEWEST_ECHOES and self._error_ns <= self.max_error_ns
         return enough and now_ns - self._echoes[-1].local_ns <= MAX_AGE_NS
 
-    def add(self, sent_ns: int, received_ns: int, ticks: int) -> None:
-        """Take an echo that was sent and received at these local times."""
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the last echo contradicted the clock."""
+        return bool(self._refused)
+
+    @property
+    def another(self) -> bool:
+        """Whether the echoes that were refused agree on another clock."""
+        return len(self._refused) >= FEWEST_OF_ANOTHER
+
+    def add(self, sent_ns: int, received_ns: int, ticks: int) -> bool:
+        """Take an echo that was sent and received at these local times; return whether it was not refused."""
         if received_ns < sent_ns:
-            return
+            return False
         echo = Echo(ticks, (sent_ns + received_ns) // 2, (received_ns - sent_ns) / 2)
         if self._origin is not None:
             off = abs(self.local_ns(ticks) - echo.local_ns)
-            if off > echo.error_ns + self._error_ns + RESTART_NS:
-                self.restart_count += 1
-                self._echoes.clear()
-                self._ns_per_tick = NANOSECONDS / self.frequency
+            if off > echo.error_ns + self._error_ns + OTHER_CLOCK_NS:
+                self._refuse(echo)
+                return False
+        self._refused.clear()
         self._echoes.append(echo)
         self._fit()
+        return True
+
+    def restart(self) -> None:
+        """Follow the clock of the echoes that were refused."""
+        self.restart_count += 1
+        self._ns_per_tick = NANOSECONDS / self.frequency
+        self._echoes.clear()
+        self._echoes.extend(self._refused)
+        self._refused.clear()
+        self._fit()
+
+    def _refuse(self, echo: Echo) -> None:
+        if self._refused:
+            first = self._refused[0]
+            expected = first.local_ns + (echo.ticks - first.ticks) * NANOSECONDS / self.frequency
+            if abs(expected - echo.local_ns) > first.error_ns + echo.error_ns + OTHER_CLOCK_NS:
+                self._refused.clear()
+        # As many as make a clock that is ready.
+        self._refused = [*self._refused, echo][-FEWEST_ECHOES:]
 
     def local_ns(self, ticks: int) -> int:
         """Local time of a tick; `ready` must hold, or at least one echo be known."""

@@ -1,0 +1,8 @@
+"""Entry points of the package's executables, which can be stopped while their modules are imported."""
+
+from knee_gap_node.entry import entry
+
+demo = entry("knee_gap_bringup.demo")
+leg_controller_node = entry("knee_gap_bringup.leg_controller_node", node=True)
+live = entry("knee_gap_bringup.live_command")
+replay = entry("knee_gap_bringup.replay_command")

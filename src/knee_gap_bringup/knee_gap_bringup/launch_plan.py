@@ -1,0 +1,194 @@
+"""What is started together, what is wrong before anything is, and what follows when a process ends.
+
+Plain data and plain functions: the launch files turn a plan into launch's actions; where launch is not
+installed, `supervisor` runs it. Both behave alike because both ask here.
+"""
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+
+from knee_gap_node.bag_paths import missing_bag
+
+NODES = {
+    "segmentation_node": "knee_gap_perception",
+    "tracking_node": "knee_gap_perception",
+    "uncertainty_node": "knee_gap_uncertainty",
+}
+INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
+OUTPUTS = (
+    "gap_edges",
+    "scope_pose",
+    "scope_turn",
+    "scope_notch",
+    "scope_calibration",
+    "gap",
+    "gap/min",
+    "gap/max",
+    "gap/snr",
+    "gap_profile",
+    "motion_advice",
+)
+CALIBRATION_FILE = "calibration.yaml"
+# Time for the last image to pass through the nodes [s].
+DRAIN = 1.0
+# Pause before a node that ended is started again [s].
+RESPAWN_DELAY = 1.0
+# With this code a node refuses its settings: started again, it would refuse them again.
+REFUSED_SETTINGS = 2
+
+
+class Role(Enum):
+    """What a process is for, which decides what its end means."""
+
+    NODE = "node"
+    PLAYER = "player"
+    RECORDER = "recorder"
+
+
+class Next(Enum):
+    """What follows the end of a process."""
+
+    START_AGAIN = "start again"
+    END_AFTER_DRAIN = "end after the last image"
+    END = "end"
+    NOTHING = "nothing"
+
+
+class Reaction(NamedTuple):
+    """What follows, the exit code that the whole ends with, and why."""
+
+    next: Next
+    code: int
+    words: str
+
+
+@dataclass(frozen=True)
+class PlannedProcess:
+    """One process; `parameters` are files and mappings, as launch takes them."""
+
+    package: str
+    executable: str
+    role: Role = Role.NODE
+    arguments: tuple[str, ...] = ()
+    namespace: str = ""
+    parameters: tuple[str | Mapping[str, object], ...] = ()
+    respawn: bool = False
+
+    @property
+    def ros_arguments(self) -> tuple[str, ...]:
+        """The arguments by which a node takes its namespace and parameters on a command line."""
+        if self.role is not Role.NODE:
+            return ()
+        given = ["--ros-args", "-r", f"__ns:={absolute(self.namespace)}"]
+        for parameters in self.parameters:
+            if isinstance(parameters, str):
+                given += ["--params-file", parameters]
+            else:
+                for name, value in parameters.items():
+                    given += ["-p", f"{name}:={value}"]
+        return tuple(given)
+
+
+def live_plan(params: str, namespace: str, *, respawn: bool = True) -> tuple[PlannedProcess, ...]:
+    """The three nodes with one parameter file; `respawn`: those that end are started again."""
+    return tuple(
+        PlannedProcess(package, name, namespace=namespace, parameters=(params,), respawn=respawn)
+        for name, package in NODES.items()
+    )
+
+
+def replay_plan(
+    bag: str, out: str, *, rate: str = "1.0", params: str = "", namespace: str = "knee_gap"
+) -> tuple[PlannedProcess, ...]:
+    """The three nodes, a recorder of their output if `out` is given, and the player, whose end ends all."""
+    space = absolute(namespace)
+    inputs = [f"{space}/{topic}" for topic in INPUTS]
+    given = (params,) if params else ()
+    own: dict[str, tuple[str | Mapping[str, object], ...]] = {
+        name: given or _beside(Path(bag), name) for name in NODES
+    }
+    own["segmentation_node"] += ({"image_transport": "compressed"},)
+    plan = [
+        PlannedProcess(package, name, namespace=namespace, parameters=own[name])
+        for name, package in NODES.items()
+    ]
+    if out:
+        topics = (f"{space}/{topic}" for topic in OUTPUTS)
+        plan.append(PlannedProcess("knee_gap_replay", "record", Role.RECORDER, (out, *topics)))
+    play = (bag, "--rate", rate, "--topics", *inputs, "--wait-for", *inputs, "--delay", "1")
+    plan.append(PlannedProcess("knee_gap_replay", "play", Role.PLAYER, play))
+    return tuple(plan)
+
+
+def _beside(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
+    """What stands beside a simulated bag for a node: its calibration, or where its lens nominally sits."""
+    calibration, nominal = bag / CALIBRATION_FILE, bag / "scope.yaml"
+    if calibration.is_file():
+        # uncertainty_node is told by the two others.
+        return () if node == "uncertainty_node" else ({"calibration_file": str(calibration.resolve())},)
+    return (str(nominal),) if node == "tracking_node" and nominal.is_file() else ()
+
+
+def live_problem(params: str, respawn_delay: str = str(RESPAWN_DELAY)) -> str:
+    """Why the nodes cannot be started, in one line; empty if they can."""
+    if problem := _number_problem("respawn_delay", respawn_delay, lowest=0.1):
+        return problem
+    return _file_problem("params", params)
+
+
+def replay_problem(bag: str, out: str, *, rate: str = "1.0", params: str = "") -> str:
+    """Why a bag cannot be replayed, in one line; empty if it can. Looks before anything is started."""
+    if missing := missing_bag(Path(bag)):
+        return f"bag: {missing}"
+    if out and os.path.lexists(out):
+        return f"out: {out} exists already; choose another name or remove it"
+    if problem := _number_problem("rate", rate):
+        return problem
+    return _file_problem("params", params) if params else ""
+
+
+def reaction(process: PlannedProcess, code: int, *, ending: bool = False) -> Reaction:
+    """What follows when a process ended with `code`, negative for a signal; `ending`: all were asked to."""
+    name, exit_code = process.executable, exit_code_of(code)
+    words = f"{name} ended with exit code {code}" if code >= 0 else f"{name} was ended by signal {-code}"
+    if process.role is Role.RECORDER and code != 0:
+        # What was recorded is not whole, however all came to its end.
+        return Reaction(Next.NOTHING if ending else Next.END, exit_code, words)
+    if ending:
+        return Reaction(Next.NOTHING, 0, words)
+    if process.role is Role.PLAYER and code == 0:
+        return Reaction(Next.END_AFTER_DRAIN, 0, "the bag has ended")
+    if process.respawn and code != REFUSED_SETTINGS:
+        return Reaction(Next.START_AGAIN, 0, words)
+    return Reaction(Next.END, exit_code, words)
+
+
+def exit_code_of(code: int) -> int:
+    """The exit code by which a shell tells how a process ended, of 128 and more for a signal."""
+    return code if code >= 0 else 128 - code
+
+
+def absolute(namespace: str) -> str:
+    """A namespace as topics carry it."""
+    return "/" + namespace.strip("/")
+
+
+def _file_problem(name: str, path: str) -> str:
+    if not os.path.exists(path):
+        return f"{name}: {path} does not exist"
+    return "" if os.path.isfile(path) else f"{name}: {path} is not a file"
+
+
+def _number_problem(name: str, text: str, lowest: float = 1e-6) -> str:
+    try:
+        number = float(text)
+    except ValueError:
+        return f"{name}: '{text}' is not a number"
+    if not math.isfinite(number) or number < lowest:
+        return f"{name}: must be a finite number of at least {lowest:g}, is {text}"
+    return ""

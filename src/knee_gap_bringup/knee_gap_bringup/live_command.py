@@ -1,0 +1,44 @@
+"""The three nodes on live topics, as live.launch.py starts them, where launch is not installed."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+
+from knee_gap_bringup.launch_plan import RESPAWN_DELAY, live_plan, live_problem
+from knee_gap_bringup.supervisor import supervise
+from knee_gap_replay.command_line import Parser
+
+
+def tell(line: str) -> None:
+    """Print a line at once."""
+    print(f"live: {line}", flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the nodes until a signal comes or one of them fails for good; return its code, or 0."""
+    params = Path(get_package_share_directory("knee_gap_bringup")) / "config" / "knee_gap.yaml"
+    parser = Parser(prog="live", description=__doc__)
+    parser.add_argument("--params", default=str(params), metavar="FILE", help="parameters of the nodes")
+    parser.add_argument("--namespace", default="knee_gap", help="namespace of the nodes (knee_gap)")
+    parser.add_argument(
+        "--respawn",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="start a node that ended again (yes)",
+    )
+    parser.add_argument(
+        "--respawn-delay", default=str(RESPAWN_DELAY), metavar="S", help="pause before that (1)"
+    )
+    arguments = parser.parse_args(argv)
+    if problem := live_problem(arguments.params, arguments.respawn_delay):
+        print(f"live: {problem}", file=sys.stderr)
+        return 1
+    plan = live_plan(arguments.params, arguments.namespace, respawn=arguments.respawn)
+    return supervise(plan, tell=tell, respawn_delay=float(arguments.respawn_delay))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

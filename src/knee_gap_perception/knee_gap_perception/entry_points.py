@@ -1,0 +1,9 @@
+"""Entry points of the package's executables, which can be stopped while their modules are imported."""
+
+from knee_gap_node.entry import entry
+
+calibrate = entry("knee_gap_perception.calibration.command")
+evaluate = entry("knee_gap_perception.evaluate")
+segmentation_node = entry("knee_gap_perception.segmentation_node", node=True)
+tracker_precision = entry("knee_gap_perception.tracker_precision_command")
+tracking_node = entry("knee_gap_perception.tracking_node", node=True)
