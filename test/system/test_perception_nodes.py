@@ -60,7 +60,8 @@ def image_message(picture: np.ndarray, stamp_ns: int, encoding: str = "bgr8") ->
 def segmentation(tmp_path: Path) -> Iterator[tuple[Client, Processes]]:
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         command = [executable("knee_gap_perception", "segmentation_node")]
-        processes.start("segmentation_node", [*command, "--ros-args", "-r", "__ns:=/knee_gap"])
+        command += ["--ros-args", "-r", "__ns:=/knee_gap", "-p", "medium:=air"]
+        processes.start("segmentation_node", command)
         client.offer(Image, "image_raw")
         client.offer(CameraInfo, "camera_info")
         client.listen(GapEdges, "gap_edges")
@@ -229,7 +230,8 @@ def test_images_compressed(frames: list[np.ndarray], camera: CameraInfo, tmp_pat
             "-r",
             "__ns:=/knee_gap",
         ]
-        processes.start("segmentation_node", [*command, "-p", "image_transport:=compressed"])
+        command += ["-p", "image_transport:=compressed", "-p", "medium:=air"]
+        processes.start("segmentation_node", command)
         client.offer(CompressedImage, "image_raw/compressed")
         client.offer(CameraInfo, "camera_info")
         client.listen(GapEdges, "gap_edges")

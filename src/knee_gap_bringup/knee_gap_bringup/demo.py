@@ -51,7 +51,7 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
             if rate != 1.0:
                 # Waiting is then measured by the bag's clock.
                 command += ["-p", "use_sim_time:=true"]
-            if node == "tracking_node":
+            if node != "uncertainty_node":
                 command += ["--params-file", str(bag / PARAMETERS_FILE)]
             if node == "segmentation_node":
                 command += ["-p", "image_transport:=compressed"]

@@ -42,7 +42,7 @@ def start(context: object) -> list[object]:
     bag = LaunchConfiguration("bag").perform(context)
     out = LaunchConfiguration("out").perform(context)
     given = LaunchConfiguration("params").perform(context)
-    # A simulated bag carries the place of the lens on the tracked body beside it.
+    # A simulated bag carries the place of the lens on the tracked body, and its medium, beside it.
     beside = Path(bag) / "scope.yaml"
     parameters = [str(beside)] if not given and beside.is_file() else [given] if given else []
     player = Node(
@@ -66,8 +66,7 @@ def start(context: object) -> list[object]:
             package="knee_gap_perception",
             executable="segmentation_node",
             namespace=namespace,
-            # What stands beside a simulated bag is of the tracked body alone.
-            parameters=[*([given] if given else []), {"image_transport": "compressed"}],
+            parameters=[*parameters, {"image_transport": "compressed"}],
         ),
         Node(
             package="knee_gap_perception",

@@ -13,6 +13,7 @@ from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee import KIND as KNEE
 from knee_gap_simulation.knee import KneeScene
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import RefractedLens, calibrated
 from knee_gap_simulation.probe import Probe
 from knee_gap_simulation.rigid import FloatArray, inverse
 from knee_gap_simulation.rims import KIND as RIMS
@@ -66,11 +67,13 @@ class SceneTruth:
             "format": 1,
             "scene": self.scene.as_dict(),
             "T_world_scene": self.T_world_scene.tolist(),
-            "lens": asdict(self.lens),
+            "lens": asdict(calibrated(self.lens)),
             "scope": asdict(self.scope),
             "T_body_lens": self.scope.body_to_lens().tolist(),
             **more,
         }
+        if isinstance(self.lens, RefractedLens):
+            values["index_ratio"] = self.lens.ratio
         if self.probe is not None:
             values["probe"] = self.probe.as_dict()
         return {METADATA_KEY: json.dumps(values, sort_keys=True)}
@@ -100,7 +103,7 @@ def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
     return SceneTruth(
         scene=scene,
         T_world_scene=np.array(values["T_world_scene"]),
-        lens=Lens(**values["lens"]),
+        lens=RefractedLens.of(Lens(**values["lens"]), values.get("index_ratio", 1.0)),
         scope=Scope.from_dict(values["scope"]),
         probe=Probe.from_dict(values["probe"]) if "probe" in values else None,
     )

@@ -246,7 +246,9 @@ class GapEstimator:
             return self._without(edges.stamp_ns, GapStatus.JOINT_MOVED, edges.track_id, LEG_MOVED)
         if self._track is None or begins:
             self._leg_at_first = self._leg.pose if self._leg is not None else None
-            self._track = Track(edges.track_id, pose.frame_id, self.parameters, self._calibration_error)
+            if error is None and edges.camera_errors.shape[-1]:
+                error = CalibrationError(np.zeros((6, 6)), 0.0)  # of the camera alone, which the edges tell
+            self._track = Track(edges.track_id, pose.frame_id, self.parameters, error)
         try:
             estimate = self._track.add(edges, pose)
         except (MeasurementError, ArithmeticError, ValueError):
