@@ -70,9 +70,9 @@ PIXEL_NOISE = NOISE / IN_SALINE.radians_per_pixel([640, 360])
 
 
 class Window(NamedTuple):
-    """A window before the lens: the index beyond, its normal (3,), how far the pupil lies behind it [m]."""
+    """A window before the lens: the index outside, its normal (3,), how far the pupil lies behind it [m]."""
 
-    index: float = 1.336
+    outside: float = 1.336
     normal: Array = np.array([0.0, 0.0, 1.0])
     depth: float = 0.0
 
@@ -90,7 +90,7 @@ class Window(NamedTuple):
             origin = self.depth * ray / ray[:, 2:]
             towards = points - origin
             towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-            along = self.index * (towards - (towards @ self.normal)[:, None] * self.normal)
+            along = self.outside * (towards - (towards @ self.normal)[:, None] * self.normal)
             ahead = np.sqrt(1.0 - (along**2).sum(axis=1, keepdims=True))
             ray = along + ahead * self.normal
         return LENS.pixels(ray)

@@ -148,7 +148,7 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
         portal=recording.portal,
         shaft=turned.scope.shaft_in_lens(),
     )
-    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, turned.scope)
+    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, turned.scope, media=recording.media)
     times = tracker_times(recording.duration_s, recording.fps)
     view = _View(recording, motion, turned)
     lenses = truth.T_world_scene @ np.array([view.lens(time) for time in times.clip(0.0)])
@@ -162,7 +162,6 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
             _rim_images(recording, truth, view, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
-        media=recording.media,
         recording=recording.as_dict(),
     )
     return truth
@@ -170,7 +169,9 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
 
 def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTruth:
     """Render a bench into a new bag at ``path``, as `make_bag` does, and return its truth."""
-    truth = SceneTruth(bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe)
+    truth = SceneTruth(
+        bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe, bench.settings.media
+    )
     times, bodies, lenses = bench.tracked_body_poses()
     _write(
         path,
@@ -180,15 +181,14 @@ def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTr
             _knee_images(bench, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
-        media=bench.settings.media,
         bench=bench.settings.as_dict(),
     )
     return truth
 
 
-def _write(path: Path, truth: SceneTruth, samples: Iterator[Sample], media: Media, **settings: Any) -> None:
+def _write(path: Path, truth: SceneTruth, samples: Iterator[Sample], **settings: Any) -> None:
     write_recording(path, samples, truth.lens, truth.as_metadata(**settings))
-    write_parameters(path / PARAMETERS_FILE, truth.scope, media)
+    write_parameters(path / PARAMETERS_FILE, truth.scope, truth.media)
 
 
 def _rim_images(recording: Recording, truth: SceneTruth, view: _View, *, progress: bool) -> Iterator[Sample]:

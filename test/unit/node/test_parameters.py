@@ -100,5 +100,7 @@ def test_misspelt_name_is_refused_with_the_names_there_are() -> None:
     node = StandIn()
     declare(node, Settings)
     refuse_unknown(node, ["rate", "use_sim_time"])
-    with pytest.raises(ConfigurationError, match="no parameter ratte; there are: count, limit, medium, offset, rate"):
+    with pytest.raises(
+        ConfigurationError, match="no parameter ratte; there are: count, limit, medium, offset, rate"
+    ):
         refuse_unknown(node, ["ratte"])

@@ -1,4 +1,4 @@
-"""A simulated scope that was calibrated in air, measures in saline and turns about its portal: no bias, bounds hold."""
+"""A simulated scope, calibrated in air, measures in saline and turns about its portal: no bias, bounds hold."""
 
 from pathlib import Path
 
@@ -56,7 +56,9 @@ def test_nodes_that_disagree_and_unknown_media_are_refused(
         (text.replace("medium: saline", "medium: beer"), "medium must be air, saline, water"),
     ):
         (tmp_path / "wrong.yaml").write_text(changed)
-        assert process.main([str(wet), str(tmp_path / "o"), "--params-file", str(tmp_path / "wrong.yaml")]) == 1
+        assert (
+            process.main([str(wet), str(tmp_path / "o"), "--params-file", str(tmp_path / "wrong.yaml")]) == 1
+        )
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         assert words in error

@@ -102,6 +102,7 @@ def test_a_bag_says_its_media_and_keeps_the_calibrated_camera(tmp_path: Path) ->
         told = json.loads(bag.metadata[METADATA_KEY])["recording"]
     assert info.k[0] == Lens().focal_px
     assert back.lens == truth.lens == RefractedLens.of(Lens(), RATIO)
+    assert back.media == truth.media == Media("air", "saline")
     assert (told["medium"], told["portal"]) == ("saline", 0.05)
 
 
@@ -138,6 +139,7 @@ def test_a_knee_and_a_board_lie_in_the_medium_too() -> None:
 def test_mistakes_end_in_a_line(
     arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    code: object
     try:
         code = main([str(tmp_path / "bag"), *arguments])
     except SystemExit as end:
