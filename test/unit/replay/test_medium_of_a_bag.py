@@ -1,4 +1,4 @@
-"""A simulated scope, calibrated in air, measures in saline and turns about its portal: no bias, bounds hold."""
+"""A simulated scope, calibrated in air, measures in saline and turns about its portal: bounds hold."""
 
 from pathlib import Path
 
