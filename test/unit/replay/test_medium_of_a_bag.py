@@ -9,6 +9,8 @@ from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_replay import process
 from knee_gap_simulation.make_bag import Recording, make_bag
 
+pytestmark = pytest.mark.timeout(900)  # 67 images are rendered
+
 
 @pytest.fixture(scope="module")
 def wet(tmp_path_factory: pytest.TempPathFactory) -> Path:
