@@ -127,7 +127,7 @@ def command(node: str, bag: Path) -> list[str]:
     started = [executable(NODES[node], node), "--ros-args", "-r", "__ns:=/knee_gap"]
     if node == "segmentation_node":
         started += ["-p", "image_transport:=compressed"]
-    if node == "tracking_node":
+    if node != "uncertainty_node":
         started += ["--params-file", str(bag / PARAMETERS_FILE)]
     return started
 

@@ -60,7 +60,8 @@ def image_message(picture: np.ndarray, stamp_ns: int, encoding: str = "bgr8") ->
 def segmentation(tmp_path: Path) -> Iterator[tuple[Client, Processes]]:
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         command = [executable("knee_gap_perception", "segmentation_node")]
-        processes.start("segmentation_node", [*command, "--ros-args", "-r", "__ns:=/knee_gap"])
+        command += ["--ros-args", "-r", "__ns:=/knee_gap", "-p", "medium:=1.0"]  # air, as a number
+        processes.start("segmentation_node", command)
         client.offer(Image, "image_raw")
         client.offer(CameraInfo, "camera_info")
         client.listen(GapEdges, "gap_edges")
@@ -203,6 +204,8 @@ def test_tracking_node_publishes_good_poses_only(tmp_path: Path) -> None:
         (["-p", "no_such_parameter:=1"], "no parameter no_such_parameter; there are: "),
         (["-p", "image_transport:=smoke_signals"], "image_transport"),
         (["-p", "working_rows:=-5"], "working_rows"),
+        (["-p", "medium:=beer"], "medium must be air, saline, water or a refractive index"),
+        (["-p", "camera_info_medium:=0.5"], "camera_info_medium must be"),
         (["--params-file", "/nowhere/at/all.yaml"], "all.yaml"),
     ],
 )
@@ -229,7 +232,8 @@ def test_images_compressed(frames: list[np.ndarray], camera: CameraInfo, tmp_pat
             "-r",
             "__ns:=/knee_gap",
         ]
-        processes.start("segmentation_node", [*command, "-p", "image_transport:=compressed"])
+        command += ["-p", "image_transport:=compressed", "-p", "medium:=air"]
+        processes.start("segmentation_node", command)
         client.offer(CompressedImage, "image_raw/compressed")
         client.offer(CameraInfo, "camera_info")
         client.listen(GapEdges, "gap_edges")

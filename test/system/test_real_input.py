@@ -76,7 +76,7 @@ def write_bag(path: Path) -> int:
         for time_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, time_ns)
     (path / PARAMETERS_FILE).write_text(
-        "/**:\n  ros__parameters:\n    body_to_shaft_translation: [0.0, 0.0, 0.2]\n"
+        "/**/tracking_node:\n  ros__parameters:\n    body_to_shaft_translation: [0.0, 0.0, 0.2]\n"
     )
     return 100
 

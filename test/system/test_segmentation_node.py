@@ -107,7 +107,7 @@ def feed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Feed]:
     with Processes(tmp_path_factory.mktemp("logs"), ENVIRONMENT) as processes, Client(DOMAIN) as client:
         command = [executable("knee_gap_perception", "segmentation_node"), "--ros-args"]
         # A wait that a busy machine does not exceed before the pose arrives.
-        command += ["-r", "__ns:=/knee_gap", "-p", "max_pose_wait:=0.1"]
+        command += ["-r", "__ns:=/knee_gap", "-p", "max_pose_wait:=0.1", "-p", "medium:=air"]
         processes.start("segmentation_node", command)
         client.offer(Image, "image_raw")
         client.offer(CameraInfo, "camera_info")

@@ -7,6 +7,7 @@ track would make one estimate out of two.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields
+from types import UnionType
 from typing import Any, TypeVar, get_origin, get_type_hints
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -22,6 +23,8 @@ ALWAYS_ALLOWED = ("use_sim_time", "start_type_description_service", "qos_overrid
 def descriptor_of(field: "Field[Any]", kind: object) -> ParameterDescriptor:
     """Descriptor of one field: what it means and which values it takes."""
     descriptor = ParameterDescriptor(description=str(field.metadata.get("description", "")), read_only=True)
+    # A name or a number: the dataclass checks what ROS cannot.
+    descriptor.dynamic_typing = isinstance(kind, UnionType)
     choices = field.metadata.get("choices")
     if choices:
         descriptor.additional_constraints = "one of: " + ", ".join(choices)

@@ -5,7 +5,7 @@ and not foretold. It waits for nothing else, and not where no pose is to be expe
 """
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import nan
 from typing import Any, NamedTuple
@@ -15,12 +15,14 @@ import numpy as np
 from knee_gap_perception.calibration.bearing_errors import BearingErrors
 from knee_gap_perception.calibration.calibration_file import Calibration
 from knee_gap_perception.calibration.camera_check import disagreement
-from knee_gap_perception.camera import Camera, camera_from_info
+from knee_gap_perception.camera import Camera, camera_from_info, camera_in_medium
+from knee_gap_perception.camera_errors import CameraErrors, ErrorSource
 from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edges import EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.lens_pose_prediction import LensPosePredictor
+from knee_gap_perception.medium import AIR, SALINE, Medium
 from knee_gap_perception.messages import (
     Image,
     image_from_compressed,
@@ -59,6 +61,8 @@ class EdgeStream:
     Images are handed in by `on_image` and come out, in order, as edges from `ready`. With a `calibration` the
     camera is its own, whatever camera_info says, and images of another size are refused. `by_notch`: the
     notch is looked for in every image as it arrives, and there is one lens pose an image, which rests on it.
+    The scope is used in `medium`, and a camera that was calibrated in another is converted to it; that of
+    camera_info was calibrated in `camera_info_medium`.
     Tracks are numbered from `first_track_id` on.
     Raises PerceptionError for a calibration without a camera, or without the notch that is to be found.
     """
@@ -71,7 +75,10 @@ class EdgeStream:
         *,
         by_notch: bool = False,
         first_track_id: int = 1,
+        medium: Medium = SALINE,
+        camera_info_medium: Medium = AIR,
     ) -> None:
+        self._medium, self._camera_info_medium = medium, camera_info_medium
         self.detector = GapEdgeDetector(parameters, first_track_id)
         self.counts: Counter[str] = Counter()
         self.latest: GapEdges | None = None
@@ -84,10 +91,10 @@ class EdgeStream:
         self.calibration = calibration
         # Why the images are none of the calibration's; empty where they are.
         self.size_flaw = ""
-        self._bearing_errors: BearingErrors | None = None
+        self._camera_errors: CameraErrors | None = None
         if calibration is not None:
-            self._bearing_errors = BearingErrors(calibration.require_camera())
-            self._camera, self._camera_flaw = calibration.require_camera().camera(), ""
+            intrinsics = calibration.require_camera()
+            self._use_camera(intrinsics.camera(), calibration.medium, [BearingErrors(intrinsics)])
         self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
         self._notch: NotchFollower | None = None
         if by_notch:
@@ -123,18 +130,26 @@ class EdgeStream:
         # Bearings by another model are not comparable with those before.
         self.detector.end_track()
         try:
-            self._camera, self._camera_flaw = camera_from_info(message), ""
+            self._use_camera(camera_from_info(message), self._camera_info_medium, [])
         except PerceptionError as error:
             self._camera, self._camera_flaw = None, str(error)
 
+    def _use_camera(self, camera: Camera, calibrated_in: Medium, errors: Sequence[ErrorSource]) -> None:
+        """Use a camera that was calibrated in a medium, with the known errors of its numbers."""
+        self._camera, self._camera_flaw = self._in_use(camera, calibrated_in), ""
+        self._camera_errors = CameraErrors(camera, errors, calibrated_in, self._medium)
+
+    def _in_use(self, camera: Camera, calibrated_in: Medium) -> Camera:
+        return camera_in_medium(camera, calibrated_in.ratio_to(self._medium))
+
     def _compare(self, message: Any) -> None:
         """Count a camera_info that contradicts the calibration, which is used all the same."""
-        assert self.calibration is not None
+        assert self._camera is not None
         try:
-            told = camera_from_info(message)
+            told = self._in_use(camera_from_info(message), self._camera_info_medium)
         except PerceptionError:
             return  # an uncalibrated driver's is all zeros
-        if angle := disagreement(self.calibration.require_camera().camera(), told):
+        if angle := disagreement(self._camera, told):
             self.counts[f"camera_info differs from the calibration by {angle}: the calibration is used"] += 1
 
     def on_lens_pose(self, message: Any) -> None:
@@ -212,8 +227,8 @@ class EdgeStream:
             lens_pose = self._poses.at(stamp)
             self._settle_segment(stamp)
             edges = self.detector.process(stamp, image, self._camera, lens_pose, frame_id=frame_id)
-            if self._bearing_errors is not None and np.isfinite(edges.bearings).all():
-                edges = replace(edges, camera_errors=self._bearing_errors.of(edges.bearings))
+            if self._camera_errors is not None and np.isfinite(edges.bearings).all():
+                edges = replace(edges, camera_errors=self._camera_errors.of(edges.bearings))
             reason = self.detector.reason
         except PerceptionError as error:
             self.detector.end_track()

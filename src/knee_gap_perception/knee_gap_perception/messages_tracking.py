@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.camera_errors import pupil_shift
+from knee_gap_perception.medium import Medium
 from knee_gap_perception.messages import stamp_ns
 from knee_gap_perception.notch_follower import NotchSight
 from knee_gap_perception.poses import BodyPose, LensPose
@@ -47,12 +49,18 @@ def fill_lens_transform(message: Any, lens: LensPose) -> Any:
 
 
 def fill_scope_calibration(
-    message: Any, node: str, calibration: Calibration | None, *, turn_followed: bool = False
+    message: Any,
+    node: str,
+    calibration: Calibration | None,
+    *,
+    turn_followed: bool = False,
+    medium: Medium | None = None,
 ) -> Any:
     """Set every field of a knee_gap_msgs/ScopeCalibration; returns the message.
 
     `node` is who says it. Only tracking_node uses the lens on the body and the clock, and it alone may follow
-    the turn of the scope.
+    the turn of the scope. In another `medium` than the calibration's (None: the same) the lens lies elsewhere
+    along its view.
     """
     message.node, message.hash = node, calibration.hash if calibration else ""
     message.turn_followed = turn_followed
@@ -63,6 +71,7 @@ def fill_scope_calibration(
     if calibration is not None and node == "tracking_node":
         # The calibration's order is rotation first, REP-103's is position first.
         covariance = np.roll(calibration.require_lens().covariance, 3, axis=(0, 1))
+        covariance[2, 2] += pupil_shift(calibration.medium, medium or calibration.medium) ** 2
         if calibration.clock is not None:
             message.time_offset = calibration.clock.offset
             message.time_offset_error = calibration.clock.sigma

@@ -23,7 +23,11 @@ from knee_gap_perception.edges import GapEdges as Edges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
-from knee_gap_perception.segmentation_parameters import PoseParameters, TransportParameters
+from knee_gap_perception.segmentation_parameters import (
+    CameraInfoParameters,
+    PoseParameters,
+    TransportParameters,
+)
 from knee_gap_perception.warm_up import warm_up
 
 
@@ -35,6 +39,7 @@ class SegmentationNode(BaseNode):
         transport = self.declare(TransportParameters).image_transport
         poses = self.declare(PoseParameters)
         edges, calibration = self.declare(EdgeParameters), self.declare(CalibrationParameters)
+        camera_info = self.declare(CameraInfoParameters)
         self.refuse_unknown_parameters()
         try:
             self._stream = EdgeStream(
@@ -43,6 +48,8 @@ class SegmentationNode(BaseNode):
                 calibration.load(),
                 by_notch=calibration.scope_turn_notch,
                 first_track_id=unused_track_id(),
+                medium=calibration.used_in,
+                camera_info_medium=camera_info.calibrated_in,
             )
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from knee_gap_perception.medium import CHOICES, Medium, medium_of
 from knee_gap_perception.parameters import check_parameters
 
 
@@ -35,3 +36,25 @@ class PoseParameters:
 
     def __post_init__(self) -> None:
         check_parameters(self)
+
+
+@dataclass(frozen=True)
+class CameraInfoParameters:
+    """What camera_info speaks of. Raises PerceptionError for a medium that there is not."""
+
+    camera_info_medium: str | float = field(
+        default="air",
+        metadata={
+            "description": f"What the camera of camera_info was calibrated in: {CHOICES}; a calibration_file "
+            "tells its own"
+        },
+    )
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+        medium_of(self.camera_info_medium, "camera_info_medium")
+
+    @property
+    def calibrated_in(self) -> Medium:
+        """The medium that the camera of camera_info was calibrated in."""
+        return medium_of(self.camera_info_medium, "camera_info_medium")

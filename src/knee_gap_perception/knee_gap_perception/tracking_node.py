@@ -64,6 +64,7 @@ class TrackingNode(BaseNode):
             "tracking_node",
             self._tracker.calibration,
             turn_followed=self._tracker.follows_turn,
+            medium=calibration.used_in,
         )
         self._calibration.publish(told)
         # Images and what Motive sends come in threads of their own.

@@ -17,6 +17,7 @@ from knee_gap_perception.edge_parameters import EdgeParameters
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import GapEdges
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import Medium
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
@@ -32,7 +33,7 @@ from knee_gap_perception.optitrack.pose_topic import PoseTopics
 from knee_gap_perception.optitrack.scope_feed import SCOPE, SourceParameters
 from knee_gap_perception.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.poses import LensPose
-from knee_gap_perception.segmentation_parameters import PoseParameters
+from knee_gap_perception.segmentation_parameters import CameraInfoParameters, PoseParameters
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
 from knee_gap_replay.errors import BagError
 from knee_gap_replay.parameters_file import ParametersFile
@@ -53,7 +54,7 @@ _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
 
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
-    "segmentation_node": (EdgeParameters, PoseParameters, CalibrationParameters),
+    "segmentation_node": (EdgeParameters, PoseParameters, CalibrationParameters, CameraInfoParameters),
     "tracking_node": (
         TrackingParameters,
         ValidityParameters,
@@ -81,13 +82,20 @@ class GapPipeline:
         """
         file.refuse_unknown(PARAMETERS)
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
-        edges, poses, calibration_of_camera = built["segmentation_node"]
+        edges, poses, calibration_of_camera, camera_info = built["segmentation_node"]
         tracking, validity, calibration_of_lens, source, _ = built["tracking_node"]
         if calibration_of_camera.scope_turn_notch != calibration_of_lens.scope_turn_notch:
             raise BagError("scope_turn_notch must be the same for segmentation_node and tracking_node")
+        if calibration_of_camera.used_in != calibration_of_lens.used_in:
+            raise BagError("medium must be the same for segmentation_node and tracking_node")
         try:
             stream = EdgeStream(
-                edges, poses, calibration_of_camera.load(), by_notch=calibration_of_camera.scope_turn_notch
+                edges,
+                poses,
+                calibration_of_camera.load(),
+                by_notch=calibration_of_camera.scope_turn_notch,
+                medium=calibration_of_camera.used_in,
+                camera_info_medium=camera_info.calibrated_in,
             )
             tracker = ScopeTracker(
                 tracking, validity, calibration_of_lens.load(), by_notch=calibration_of_lens.scope_turn_notch
@@ -102,6 +110,7 @@ class GapPipeline:
             space,
             up_axis=source.resolved_up_axis(),
             with_mask=with_mask,
+            medium=calibration_of_lens.used_in,
         )
 
     def __init__(
@@ -114,6 +123,7 @@ class GapPipeline:
         *,
         up_axis: str = "z",
         with_mask: bool = False,
+        medium: Medium | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
@@ -138,6 +148,7 @@ class GapPipeline:
                 node,
                 calibration,
                 turn_followed=node == "tracking_node" and tracker.follows_turn,
+                medium=medium,
             )
             for node, calibration in used.items()
             if any(used.values())

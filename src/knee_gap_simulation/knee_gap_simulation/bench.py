@@ -36,6 +36,7 @@ from knee_gap_simulation.knee import KneeScene
 from knee_gap_simulation.knee_camera import KneeCamera, KneeLight
 from knee_gap_simulation.knee_truth import Sightings, SurfacePoints, follow, surface_points
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import IN_SALINE, Media, Medium, RefractedLens
 from knee_gap_simulation.motion import Hand, HandMotion, TravelDirection
 from knee_gap_simulation.probe import Probe
 from knee_gap_simulation.rigid import FloatArray, from_parts
@@ -87,10 +88,17 @@ class BenchSettings:
     travel: float
     duration_s: float
     fps: float
+    media: Media = IN_SALINE
+    portal: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values for JSON."""
-        return asdict(self)
+        """The settings as plain values for JSON; those that were not asked for are left out."""
+        values = asdict(self)
+        if self.media == IN_SALINE:
+            del values["media"]
+        if self.portal is None:
+            del values["portal"]
+        return values
 
 
 class Bench:
@@ -109,8 +117,14 @@ class Bench:
         fps: float = 60.0,
         hardness: Mapping[str, int] | None = None,
         workers: int = 2,
+        medium: Medium = "saline",
+        calibrated_in: Medium | None = None,
+        portal: float | None = None,
     ) -> None:
         """Lengths [m]. ``hardness`` sets single levels by name; the result is the same for any ``workers``.
+
+        The knee is full of ``medium``; ``bench.lens`` is the lens there, ``Lens()`` that in ``calibrated_in``
+        (the same). ``portal``: how far behind the tip the hand turns the scope, as `HandMotion` has it.
 
         Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
         that does not fit into the joint.
@@ -135,10 +149,12 @@ class Bench:
             travel=travel,
             duration_s=duration_s,
             fps=fps,
+            media=Media(medium if calibrated_in is None else calibrated_in, medium),
+            portal=portal,
         )
         self.conditions: Conditions = conditions(self.settings.hardness)
         self.scene = KneeScene.random(self.settings.gap, seed, self.conditions.roughness)
-        self.lens, self.scope = Lens(), Scope()
+        self.lens, self.scope = RefractedLens.of(Lens(), self.settings.media.ratio), Scope()
         self.T_world_scene = world_from_scene(seed)
         self._workers = workers
         self._motion = self._place_hand(rng)
@@ -259,6 +275,8 @@ class Bench:
                 offset=(side, up + shift, 0.0),
                 hand=hand,
                 seed=settings.seed,
+                portal=settings.portal,
+                shaft=self.scope.shaft_in_lens(),
             )
             clearance = float(self.scene.distance(motion.poses(times)[:, :3, 3]).min())
             if clearance >= LEAST_CLEARANCE:

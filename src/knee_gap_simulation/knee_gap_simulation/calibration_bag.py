@@ -18,6 +18,7 @@ from knee_gap_simulation.calibration_scene import Board, BoardCamera, ChessBoard
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.imaging import jpeg
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import Media, Medium, RefractedLens, calibrated
 from knee_gap_simulation.pinhole import PinholeLens
 from knee_gap_simulation.recording import (
     BODY_POSE,
@@ -46,7 +47,7 @@ LENSES: dict[str, Lens] = {"equidistant": Lens(), "pinhole": PinholeLens()}
 
 @dataclass(frozen=True)
 class CalibrationRecording:
-    """What to record, with a board of BOARDS and a lens of LENSES.
+    """What to record, with a board of BOARDS and a lens of LENSES, which is as air has it, in `medium`.
 
     `video_delay` [s]: how late images are stamped, so that the time offset is minus it.
     """
@@ -61,6 +62,14 @@ class CalibrationRecording:
     noise: TrackerNoise = field(default_factory=TrackerNoise)
     board: str = "charuco"
     lens: str = "equidistant"
+    medium: Medium = "air"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values for JSON; the medium where it is not air."""
+        values = asdict(self)
+        if self.medium == "air":
+            del values["medium"]
+        return values
 
     def __post_init__(self) -> None:
         for name, choices in (("board", list(BOARDS)), ("lens", list(LENSES))):
@@ -81,7 +90,7 @@ class CalibrationRecording:
 
 @dataclass(frozen=True)
 class CalibrationTruth:
-    """What a calibration of the bag should find."""
+    """What a calibration of the bag should find; `lens` is that in the recording's medium."""
 
     lens: Lens
     scope: TurnedScope
@@ -95,7 +104,8 @@ class CalibrationTruth:
         """The truth in plain numbers; transforms as translation [m] and quaternion."""
         shaft = self.scope.scope.body_to_shaft()
         return {
-            "lens": asdict(self.lens),
+            "lens": asdict(calibrated(self.lens)),
+            **({"index_ratio": self.lens.ratio} if isinstance(self.lens, RefractedLens) else {}),
             "T_body_lens": _plain(self.scope.body_to_lens(0.0)),
             "T_world_board": _plain(self.T_world_board),
             "shaft_direction": shaft[:3, 2].tolist(),
@@ -127,7 +137,7 @@ def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
     turned = TurnedScope(scope, notch_angle=rng.uniform(-np.pi, np.pi))
     shaft = scope.body_to_shaft()
     return CalibrationTruth(
-        lens=lens,
+        lens=RefractedLens.of(lens, Media("air", recording.medium).ratio),
         scope=turned,
         board=BOARDS[recording.board],
         T_world_board=transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5])),
@@ -213,7 +223,7 @@ def make_calibration_bag(
     motion = CalibrationMotion(chosen, truth)
     metadata = {
         "knee_gap_calibration_truth": json.dumps(truth.as_dict()),
-        "knee_gap_calibration_recording": json.dumps(asdict(chosen)),
+        "knee_gap_calibration_recording": json.dumps(chosen.as_dict()),
     }
     with BagWriter(path, metadata=metadata) as bag:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage", "sensor")

@@ -27,6 +27,7 @@ from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import Hardness
 from knee_gap_simulation.imaging import Sensor, jpeg
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import INDICES, Media, Medium, RefractedLens, index_of
 from knee_gap_simulation.motion import HandMotion, TravelDirection
 from knee_gap_simulation.recording import (
     PARAMETERS_FILE,
@@ -52,7 +53,9 @@ class Recording:
     `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording;
     without it they are the nominal ones. `video_delay`: how late images are stamped. `turn` [rad]: how far
     that scope is turned to and fro in its camera head, which carries the tracked body; its notch is seen
-    then.
+    then. The rims lie in `medium` (saline). The lens was calibrated in `calibrated_in`: the same medium, but
+    air for the scope of a calibration recording. `portal` is how far behind the tip the hand turns the
+    scope, as `HandMotion` has it.
     """
 
     gap: float = 0.004
@@ -65,6 +68,23 @@ class Recording:
     scope_of: int | None = None
     video_delay: float = 0.0
     turn: float | None = None
+    medium: Medium | None = None
+    calibrated_in: Medium | None = None
+    portal: float | None = None
+
+    @property
+    def media(self) -> Media:
+        """What the lens was calibrated in and is used in."""
+        used_in: Medium = "saline" if self.medium is None else self.medium
+        calibrated_in = used_in if self.scope_of is None else "air"
+        return Media(calibrated_in if self.calibrated_in is None else self.calibrated_in, used_in)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values for JSON; media and portal where they were asked for."""
+        optional = ("medium", "calibrated_in", "portal")
+        return {
+            name: value for name, value in vars(self).items() if name not in optional or value is not None
+        }
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.duration_s <= 600.0:
@@ -112,16 +132,23 @@ class _View:
 def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> SceneTruth:
     """Render a recording of the simple scene into a new bag at ``path`` and return its truth.
 
-    Beside the data the folder gets ``scope.yaml``, the parameters of the tracking node. Raises
+    Beside the data the folder gets ``scope.yaml``, the parameters of the nodes that see and track. Raises
     SimulationError for a recording that cannot be made and BagError where the bag cannot be written.
     """
     scene = RimScene.random(recording.gap, recording.seed)
-    motion = HandMotion(travel=recording.travel, depth=recording.depth, seed=recording.seed)
     lens, turned = Lens(), TurnedScope()
     if recording.scope_of is not None:
-        calibrated = calibration_truth(CalibrationRecording(seed=recording.scope_of))
-        lens, turned = calibrated.lens, calibrated.scope
-    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, turned.scope)
+        of_scope = calibration_truth(CalibrationRecording(seed=recording.scope_of))
+        lens, turned = of_scope.lens, of_scope.scope
+    lens = RefractedLens.of(lens, recording.media.ratio)
+    motion = HandMotion(
+        travel=recording.travel,
+        depth=recording.depth,
+        seed=recording.seed,
+        portal=recording.portal,
+        shaft=turned.scope.shaft_in_lens(),
+    )
+    truth = SceneTruth(scene, world_from_scene(recording.seed), lens, turned.scope, media=recording.media)
     times = tracker_times(recording.duration_s, recording.fps)
     view = _View(recording, motion, turned)
     lenses = truth.T_world_scene @ np.array([view.lens(time) for time in times.clip(0.0)])
@@ -135,14 +162,16 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
             _rim_images(recording, truth, view, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
-        recording=vars(recording),
+        recording=recording.as_dict(),
     )
     return truth
 
 
 def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTruth:
     """Render a bench into a new bag at ``path``, as `make_bag` does, and return its truth."""
-    truth = SceneTruth(bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe)
+    truth = SceneTruth(
+        bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe, bench.settings.media
+    )
     times, bodies, lenses = bench.tracked_body_poses()
     _write(
         path,
@@ -159,7 +188,7 @@ def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTr
 
 def _write(path: Path, truth: SceneTruth, samples: Iterator[Sample], **settings: Any) -> None:
     write_recording(path, samples, truth.lens, truth.as_metadata(**settings))
-    write_parameters(path / PARAMETERS_FILE, truth.scope)
+    write_parameters(path / PARAMETERS_FILE, truth.scope, truth.media)
 
 
 def _rim_images(recording: Recording, truth: SceneTruth, view: _View, *, progress: bool) -> Iterator[Sample]:
@@ -268,7 +297,32 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--scope-of", type=int, metavar="SEED", help="the rims seen by the scope of this calibration bag"
     )
+    parser.add_argument(
+        "--medium",
+        type=medium_argument,
+        help="what fills the joint (saline), or the board lies in (air): air, saline, water or an index",
+    )
+    parser.add_argument(
+        "--calibrated-in",
+        type=medium_argument,
+        metavar="MEDIUM",
+        help="what the lens of camera_info was calibrated in (the same; with --scope-of air)",
+    )
+    parser.add_argument(
+        "--portal-mm",
+        type=float,
+        help="the hand turns the scope about a portal so far behind its tip (it turns by 2.5 deg)",
+    )
     return parser
+
+
+def medium_argument(text: str) -> Medium:
+    """A medium by name or index. Raises argparse.ArgumentTypeError."""
+    try:
+        index = index_of(text)
+    except SimulationError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text if text in INDICES else index
 
 
 def _knee(arguments: argparse.Namespace) -> Bench:
@@ -288,7 +342,14 @@ def _knee(arguments: argparse.Namespace) -> Bench:
         duration_s=4.0 if arguments.duration_s is None else arguments.duration_s,
         fps=defaults.fps if arguments.fps is None else arguments.fps,
         hardness=dict(arguments.hardness),
+        medium=arguments.medium or "saline",
+        calibrated_in=arguments.calibrated_in,
+        portal=_portal(arguments),
     )
+
+
+def _portal(arguments: argparse.Namespace) -> float | None:
+    return None if arguments.portal_mm is None else 1e-3 * arguments.portal_mm
 
 
 def _rims(arguments: argparse.Namespace) -> Recording:
@@ -304,13 +365,25 @@ def _rims(arguments: argparse.Namespace) -> Recording:
         scope_of=arguments.scope_of,
         video_delay=1e-3 * (arguments.video_delay_ms or 0.0),
         turn=None if arguments.turn_deg is None else float(np.radians(arguments.turn_deg)),
+        medium=arguments.medium,
+        calibrated_in=arguments.calibrated_in,
+        portal=_portal(arguments),
     )
 
 
 def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
-    others = (arguments.level, arguments.gap_mm, arguments.depth_mm, arguments.travel_direction)
+    others = (
+        arguments.level,
+        arguments.gap_mm,
+        arguments.depth_mm,
+        arguments.travel_direction,
+        arguments.calibrated_in,
+        arguments.portal_mm,
+    )
     if arguments.no_gap or arguments.hardness or any(value is not None for value in others):
-        raise SimulationError("--calibration shows a board: there is no gap, knee or depth to choose")
+        raise SimulationError(
+            "--calibration shows a board: there is no gap, knee, depth, portal or other medium to choose"
+        )
     defaults = CalibrationRecording()
     delay_ms = 1e3 * defaults.video_delay if arguments.video_delay_ms is None else arguments.video_delay_ms
     return CalibrationRecording(
@@ -320,6 +393,7 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
         video_delay=1e-3 * delay_ms,
         board=arguments.board or defaults.board,
         lens=arguments.lens or defaults.lens,
+        medium=arguments.medium or defaults.medium,
         quality=defaults.quality if arguments.quality is None else arguments.quality,
     )
 

@@ -62,16 +62,26 @@ class HandMotion:
         offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
         hand: Hand | None = None,
         seed: int = 0,
+        portal: float | None = None,
+        shaft: tuple[float, float, float] = (0.0, 0.0, 1.0),
     ) -> None:
+        """Lengths [m]. `portal`: how far behind the tip the shaft passes through the skin; it turns about it.
+
+        The `shaft` points to the tip, in the frame of the lens. Without a portal the hand turns the view back
+        to the gap by `Hand.pivot_turn`.
+        """
         if not 0.0 <= travel <= 0.05:
             raise SimulationError(f"travel must lie in [0, 0.05] m, not {travel}")
         if not 0.002 <= depth <= 0.05:
             raise SimulationError(f"depth must lie in [0.002, 0.05] m, not {depth}")
         self._travel, self._depth, self._axis = travel, depth, direction.axis
+        if portal is not None and not 0.01 <= portal <= 1.0:
+            raise SimulationError(f"the portal must lie in [0.01, 1] m behind the tip, not {portal}")
         self._hand = hand or Hand()
         self._offset = np.asarray(offset, dtype=np.float64)
         view = transform([pitch, 0.0, 0.0], np.zeros(3)) @ transform([0.0, 0.0, roll], np.zeros(3))
         self._base_rotation = view[:3, :3]
+        self._arm = None if portal is None else portal * self._base_rotation @ np.asarray(shaft, dtype=float)
         rng = np.random.default_rng([seed, 0x4841])
         self._tremor = _Wander(rng, self._hand.tremor, (8.0, 12.0), waves=5)
         self._tremor_turn = _Wander(rng, self._hand.tremor_turn, (8.0, 12.0), waves=5)
@@ -95,6 +105,9 @@ class HandMotion:
         position[..., 2] -= self._depth
         position[..., self._axis] += self._travel * reached
         turn = self._tremor_turn(time) + self._drift_turn(time)
+        if self._arm is not None:
+            wobble = transform(turn, np.zeros(3))[..., :3, :3]
+            return from_parts(wobble @ self._about_portal(reached) @ self._base_rotation, position)
         # A scope pivots about its portal: moving the lens to one side turns the view to the other.
         if self._axis == 0:
             turn[..., 1] -= self._hand.pivot_turn * reached
@@ -102,6 +115,19 @@ class HandMotion:
             turn[..., 0] += self._hand.pivot_turn * reached
         rotation = transform(turn, np.zeros(3))[..., :3, :3] @ self._base_rotation
         return from_parts(rotation, position)
+
+    def _about_portal(self, reached: FloatArray) -> FloatArray:
+        """Rotations (..., 3, 3) of a shaft that passes through the portal, for shares (...) of the travel."""
+        assert self._arm is not None
+        before = self._arm / np.linalg.norm(self._arm)
+        after = self._arm + self._travel * reached[..., None] * np.eye(3)[self._axis]
+        after = after / np.linalg.norm(after, axis=-1, keepdims=True)
+        # The shortest turn from one direction to the other: a hand that does not twist the shaft.
+        across = np.cross(before, after)
+        sine = np.linalg.norm(across, axis=-1, keepdims=True)
+        angle = np.arctan2(sine, (after @ before)[..., None])
+        axis = np.divide(across, sine, out=np.zeros_like(across), where=sine > 0)
+        return np.asarray(transform(axis * angle, np.zeros(3))[..., :3, :3])
 
 
 class _Wander:

@@ -12,6 +12,7 @@ from knee_gap_replay.bag import BagWriter
 from knee_gap_replay.types import blank
 from knee_gap_simulation.clocks import stamp_ns
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import Media, calibrated
 from knee_gap_simulation.rigid import FloatArray, inverse, quaternion_xyzw
 from knee_gap_simulation.scope import Scope
 
@@ -58,12 +59,12 @@ def pose_samples(
 
 
 def write_recording(path: Path, samples: Iterable[Sample], lens: Lens, metadata: dict[str, str]) -> None:
-    """Write a new bag of samples, in the order of their ``record_ns``.
+    """Write a new bag of samples, in the order of their ``record_ns``; camera_info is the calibrated lens.
 
     The true lens pose is written at the stamp of every image, the body's poses at the tracker's own stamps.
     Raises BagError where the bag cannot be written.
     """
-    camera_info = camera_info_message(lens)
+    camera_info = camera_info_message(calibrated(lens))
     with BagWriter(path, metadata=metadata) as bag:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage", "sensor")
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", "sensor")
@@ -111,10 +112,15 @@ def pose_message(T_world_x: FloatArray, stamp_ns: int) -> Any:
     return message
 
 
-def write_parameters(path: Path, scope: Scope) -> None:
-    """Write the scope as a ROS parameter file, for any node that takes such parameters."""
+def write_parameters(path: Path, scope: Scope, media: Media) -> None:
+    """Write the scope, and what it was calibrated and is used in, as a ROS parameter file for the nodes."""
+    camera = {"camera_info_medium": media.calibrated_in, "medium": media.used_in}
+    parameters = {
+        "/**/segmentation_node": {"ros__parameters": camera},
+        "/**/tracking_node": {"ros__parameters": {**scope.parameters(), "medium": media.used_in}},
+    }
     with path.open("w", encoding="utf-8") as file:
-        YAML().dump({"/**/tracking_node": {"ros__parameters": scope.parameters()}}, file)
+        YAML().dump(parameters, file)
 
 
 def _stamp(message: Any, stamp_ns: int, frame_id: str) -> None:

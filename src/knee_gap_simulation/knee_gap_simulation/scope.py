@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import radians
+from math import cos, radians, sin
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,10 @@ class Scope:
     def body_to_lens(self) -> FloatArray:
         """``T_body_lens`` (4, 4)."""
         return self.body_to_shaft() @ transform([self.oblique_angle, 0.0, 0.0], np.zeros(3))
+
+    def shaft_in_lens(self) -> tuple[float, float, float]:
+        """Direction of the shaft, to the tip, in the frame of the lens."""
+        return 0.0, sin(self.oblique_angle), cos(self.oblique_angle)
 
     def parameters(self) -> dict[str, float | list[float]]:
         """The scope as parameters of the tracking node."""

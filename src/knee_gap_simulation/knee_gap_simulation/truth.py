@@ -13,6 +13,7 @@ from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee import KIND as KNEE
 from knee_gap_simulation.knee import KneeScene
 from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.media import IN_SALINE, Media, RefractedLens, calibrated
 from knee_gap_simulation.probe import Probe
 from knee_gap_simulation.rigid import FloatArray, inverse
 from knee_gap_simulation.rims import KIND as RIMS
@@ -24,13 +25,17 @@ METADATA_KEY = "knee_gap_simulation"
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """A scene, where it lies in the world, the scope that looked at it, and the probe that came and went."""
+    """A scene, where it lies in the world, the scope that looked at it, and the probe that came and went.
+
+    `lens` is as it is in use; `media` are what it was calibrated in and is used in.
+    """
 
     scene: RimScene | KneeScene
     T_world_scene: FloatArray
     lens: Lens
     scope: Scope
     probe: Probe | None = None
+    media: Media = IN_SALINE
 
     def surface_points(
         self, T_world_lens: npt.ArrayLike, pixels: npt.ArrayLike, stamp_ns: int | None = None
@@ -66,11 +71,13 @@ class SceneTruth:
             "format": 1,
             "scene": self.scene.as_dict(),
             "T_world_scene": self.T_world_scene.tolist(),
-            "lens": asdict(self.lens),
+            "lens": asdict(calibrated(self.lens)),
             "scope": asdict(self.scope),
             "T_body_lens": self.scope.body_to_lens().tolist(),
             **more,
         }
+        if self.media != IN_SALINE:
+            values["media"] = list(self.media)
         if self.probe is not None:
             values["probe"] = self.probe.as_dict()
         return {METADATA_KEY: json.dumps(values, sort_keys=True)}
@@ -95,12 +102,14 @@ def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
         raise SimulationError(
             f"the scene '{kind}' of format {values.get('format')} is unknown; known: {RIMS}, {KNEE}, format 1"
         )
+    media = Media(*values.get("media", IN_SALINE))
     scene: RimScene | KneeScene
     scene = (RimScene if kind == RIMS else KneeScene).from_dict(values["scene"])
     return SceneTruth(
         scene=scene,
         T_world_scene=np.array(values["T_world_scene"]),
-        lens=Lens(**values["lens"]),
+        lens=RefractedLens.of(Lens(**values["lens"]), media.ratio),
         scope=Scope.from_dict(values["scope"]),
         probe=Probe.from_dict(values["probe"]) if "probe" in values else None,
+        media=media,
     )

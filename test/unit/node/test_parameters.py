@@ -22,6 +22,8 @@ class Settings:
         default=float("nan"), metadata={"description": "limit [m]", "range": (0.0, 1.0), "nan": True}
     )
 
+    medium: str | float = field(default="saline", metadata={"description": "medium"})
+
     def __post_init__(self) -> None:
         if len(self.offset) != 2:
             raise ValueError(f"offset must have 2 numbers, not {len(self.offset)}")
@@ -37,7 +39,7 @@ class StandIn:
 
     def declare_parameter(self, name: str, default: Any, descriptor: Any) -> Any:
         value = self.given.get(name, default)
-        if type(value) is not type(default):
+        if type(value) is not type(default) and not descriptor.dynamic_typing:
             raise TypeError("wrong type")
         for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
             if not limits.from_value <= value <= limits.to_value:
@@ -71,6 +73,13 @@ def test_descriptors_tell_meaning_range_and_that_they_are_fixed() -> None:
     assert all(descriptor.read_only for descriptor in node.descriptors.values())
 
 
+def test_a_name_or_a_number_is_taken_where_either_is_meant() -> None:
+    node = StandIn(medium=1.34)
+    assert declare(node, Settings).medium == 1.34
+    assert declare(StandIn(medium="air"), Settings).medium == "air"
+    assert [name for name, one in node.descriptors.items() if one.dynamic_typing] == ["medium"]
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -91,5 +100,7 @@ def test_misspelt_name_is_refused_with_the_names_there_are() -> None:
     node = StandIn()
     declare(node, Settings)
     refuse_unknown(node, ["rate", "use_sim_time"])
-    with pytest.raises(ConfigurationError, match="no parameter ratte; there are: count, limit, offset, rate"):
+    with pytest.raises(
+        ConfigurationError, match="no parameter ratte; there are: count, limit, medium, offset, rate"
+    ):
         refuse_unknown(node, ["ratte"])

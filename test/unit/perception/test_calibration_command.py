@@ -11,6 +11,7 @@ from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.calibration.command import main
 from knee_gap_perception.calibration.rigid import inverse, to_vector
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import SALINE
 from knee_gap_replay.bag import BagReader
 from knee_gap_simulation.calibration_bag import CalibrationRecording, calibration_truth, make_calibration_bag
 from knee_gap_simulation.rigid import transform
@@ -92,6 +93,10 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "a folder that may be written"),
         (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
+        (
+            ["intrinsics", "BAG", "--into", "OUT", "--board", BOARD, "--medium", "beer"],
+            "--medium must be air",
+        ),
     ],
 )
 def test_mistakes_are_one_line(
@@ -133,3 +138,30 @@ def test_a_turned_scope_is_followed(
     if how:
         assert found.oblique.T_head_scope is not None
         assert found.scope_turn_of_body(found.oblique.T_head_scope) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_board_in_saline_gives_the_camera_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same scope as `bag` shows, its board in a bath: its angles are Snell's of those in air."""
+    recording = CalibrationRecording(seed=31, fps=5, board_s=8, oblique_s=0, pivot_s=0, medium="saline")
+    truth = make_calibration_bag(tmp_path / "bath", recording)
+    out = tmp_path / "scope.yaml"
+    board = ["--board", BOARD, "--views", 16]
+    code, _, errors = run(
+        capsys, "intrinsics", tmp_path / "bath", "--into", out, *board, "--medium", "saline"
+    )
+    assert (code, errors) == (0, [])
+    found = load_calibration(out)
+    assert found.medium == SALINE
+    camera, lens = found.require_camera().camera(), truth.lens
+    angle = np.linspace(0.0, 2.0 * np.pi, 24)
+    offset = 0.85 * lens.radius_px * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    pixels = offset + np.array([lens.centre_x_px, lens.centre_y_px])
+    apart = np.linalg.norm(camera.bearings(pixels) - lens.bearings(pixels), axis=1)
+    assert np.degrees(apart.max()) < 0.1
+    in_air = calibration_truth(CalibrationRecording(seed=31)).lens
+    assert np.degrees(np.linalg.norm(in_air.bearings(pixels) - lens.bearings(pixels), axis=1).min()) > 5.0
+    # The next step takes the file's medium, and refuses another; `show` names it.
+    code, _, errors = run(capsys, "intrinsics", tmp_path / "bath", "--into", out, *board, "--medium", "air")
+    assert code == 1
+    assert "was calibrated in saline, not in air" in errors[0]
+    assert "calibrated in saline, refractive index 1.336" in run(capsys, "show", out)[1]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from knee_gap_perception.edge_stream import MOST_WAITING, EdgeStream
 from knee_gap_perception.edges import EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import AIR
 from knee_gap_perception.segmentation_parameters import PoseParameters
 
 FRAME_NS = 33_333_333
@@ -63,7 +64,7 @@ def info_message(joint: Any) -> Any:
 
 
 def stream(joint: Any, wait: float = 0.03) -> EdgeStream:
-    made = EdgeStream(poses=PoseParameters(max_pose_wait=wait))
+    made = EdgeStream(poses=PoseParameters(max_pose_wait=wait), medium=AIR)
     made.on_camera_info(info_message(joint))
     return made
 

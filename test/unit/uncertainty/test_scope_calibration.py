@@ -284,6 +284,15 @@ def test_both_intervals_include_the_cameras_error() -> None:
         assert getattr(with_it, high) > getattr(without, high)
 
 
+def test_both_intervals_include_a_cameras_error_without_a_calibration() -> None:
+    """As of a camera_info whose angles were converted to another medium."""
+    without, with_it = estimates()[-1], estimates(camera=3.0)[-1]
+    assert with_it.status is without.status is GapStatus.VALID
+    for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
+        assert getattr(with_it, low) < getattr(without, low)
+        assert getattr(with_it, high) > getattr(without, high)
+
+
 def test_errors_of_a_camera_that_are_none_give_no_estimate() -> None:
     wrong = estimates(told("tracking_node", "a" * 64, error=NOTHING), camera=float("nan"))
     assert {estimate.status for estimate in wrong} == {GapStatus.NO_EDGES}

@@ -17,6 +17,7 @@ from knee_gap_perception.calibration.notch import NotchShape
 from knee_gap_perception.calibration.rigid import Array, rigid
 from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turn_between, turned_lens
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import AIR, Medium, medium_of
 
 FORMAT = "knee_gap_calibration 1"
 
@@ -82,7 +83,10 @@ class Clock:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All that was calibrated of one scope, for images of one size. What was not is None."""
+    """All that was calibrated of one scope, for images of one size. What was not is None.
+
+    `medium` is what the board lay in.
+    """
 
     width_px: int
     height_px: int
@@ -91,6 +95,7 @@ class Calibration:
     oblique: Oblique | None = None
     tip: Tip | None = None
     clock: Clock | None = None
+    medium: Medium = AIR
 
     @property
     def hash(self) -> str:
@@ -250,6 +255,9 @@ def _to_dict(calibration: Calibration) -> dict[str, Any]:
     content: dict[str, Any] = {
         "image": {"width_px": calibration.width_px, "height_px": calibration.height_px}
     }
+    # Left out in air, which older files do not name: they keep their hash.
+    if calibration.medium != AIR:
+        content["medium"] = calibration.medium.value
     if camera is not None:
         content["camera"] = {
             "distortion_model": camera.distortion_model,
@@ -309,6 +317,7 @@ def _from_dict(content: dict[str, Any]) -> Calibration:
         _oblique(content["oblique"]) if "oblique" in content else None,
         _tip(content["tip"]) if "tip" in content else None,
         _clock(content["clock"]) if "clock" in content else None,
+        medium_of(content["medium"], "its medium") if "medium" in content else AIR,
     )
 
 

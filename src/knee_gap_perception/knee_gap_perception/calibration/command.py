@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from knee_gap_perception.calibration.procedure import Procedure
 from knee_gap_perception.calibration.recording import Recording, Request
 from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import AIR, CHOICES, Medium, medium_of
 
 STEPS = {
     "intrinsics": "focal lengths, principal point and distortion, from a board",
@@ -52,6 +54,11 @@ def _parser() -> argparse.ArgumentParser:
         step.add_argument("--high-order", action="store_true", help="fit the high distortion terms too")
         step.add_argument("--mount", choices=[str(m) for m in Mount], default=str(defaults.mount))
         step.add_argument("--views", type=int, default=defaults.views, help="images to look for the board in")
+        step.add_argument(
+            "--medium",
+            metavar="MEDIUM",
+            help=f"what the board lies in: {CHOICES} (FILE's; a new one's: air); best what it is used in",
+        )
         step.add_argument("--fixed-intrinsics", action="store_true", help="keep the camera as it is in FILE")
         step.add_argument("--time-offset", type=float, metavar="S", help="to start from, instead of FILE's")
         step.add_argument("--max-offset", type=float, default=defaults.max_offset, metavar="S")
@@ -96,16 +103,32 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         begin=arguments.begin,
         end=arguments.end,
     )
+    given = medium_of(arguments.medium, "--medium") if arguments.medium is not None else None
     require_place(arguments.into)
+    calibration = load_calibration(arguments.into) if arguments.into.exists() else None
+    medium = _medium(given, calibration, arguments.into)
     recording = Recording(request, _progress)
     procedure = Procedure(recording, lambda line: print(f"  {line}", flush=True))
-    calibration = load_calibration(arguments.into) if arguments.into.exists() else None
     for step in _chosen(arguments.step, recording):
         print(step, flush=True)
         calibration = getattr(procedure, step)(calibration)
     if calibration is not None:
+        calibration = replace(calibration, medium=medium)
         save_calibration(calibration, arguments.into)
         print(f"{arguments.into}: hash {calibration.hash[:12]}")
+
+
+def _medium(given: Medium | None, calibration: Calibration | None, path: Path) -> Medium:
+    """What the board lies in: as given, or as in the file. Raises PerceptionError where they differ."""
+    if calibration is None or given is None:
+        return given or (calibration.medium if calibration is not None else AIR)
+    seen = calibration.camera is not None or calibration.lens is not None
+    if seen and given != calibration.medium:
+        raise PerceptionError(
+            f"{path} was calibrated in {calibration.medium.value}, not in {given.value}: take all steps in "
+            "one medium, or name a new file"
+        )
+    return given
 
 
 def _chosen(step: str, recording: Recording) -> list[str]:
@@ -139,6 +162,8 @@ def _show_parameters(calibration: Calibration) -> None:
 def _show(calibration: Calibration) -> None:
     print(f"hash {calibration.hash}")
     print(f"images {calibration.width_px}x{calibration.height_px} px")
+    index = calibration.medium.index
+    print(f"calibrated in {calibration.medium.value}, refractive index {index:g}")
     if (camera := calibration.camera) is not None:
         print(
             f"camera {camera.distortion_model}, f {camera.k[0]:.2f} {camera.k[4]:.2f} px, centre "

@@ -1,22 +1,33 @@
-"""The calibration that a node uses: named by a parameter, read once."""
+"""The calibration that a node uses, and the medium that the scope is used in: named by parameters."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import CHOICES, Medium, medium_of
 from knee_gap_perception.parameters import check_parameters
 
 
 @dataclass(frozen=True)
 class CalibrationParameters:
-    """Which calibration is used, and whether the scope is turned. Raises PerceptionError for a bad value."""
+    """Which calibration is used, in which medium, and whether the scope is turned.
+
+    Raises PerceptionError for a bad value.
+    """
 
     calibration_file: str = field(
         default="",
         metadata={
             "description": "File that `calibrate` wrote: lens on the body, clock and camera; the same for "
             "segmentation_node and tracking_node; empty: none"
+        },
+    )
+    medium: str | float = field(
+        default="saline",
+        metadata={
+            "description": f"What the scope is used in: {CHOICES}; angles of a camera that was calibrated in "
+            "another medium are converted; the same for segmentation_node and tracking_node"
         },
     )
     scope_turn_notch: bool = field(
@@ -32,6 +43,12 @@ class CalibrationParameters:
         check_parameters(self)
         if not isinstance(self.scope_turn_notch, bool):
             raise PerceptionError(f"scope_turn_notch must be true or false, not {self.scope_turn_notch!r}")
+        medium_of(self.medium, "medium")
+
+    @property
+    def used_in(self) -> Medium:
+        """The medium that the scope is used in."""
+        return medium_of(self.medium, "medium")
 
     def load(self) -> Calibration | None:
         """The calibration, None where none is named. Raises PerceptionError where it cannot be used."""
