@@ -4,7 +4,8 @@ A track is scored from its first image on: the surface points behind its first t
 Errors are told along and across the edge, in degrees, as the median over tracks of their root mean square;
 NEES is the squared error in units of its own covariance, against its expectation; held is the share of
 images with a valid track while both are to be seen. The gap is what the estimator makes of it with the
-tracked poses: its error, and the shares of valid estimates whose bounds and interval hold the true distance.
+tracked poses: its error against the true instrument gap at the section that the image's edges give, and the
+shares of valid estimates whose bounds and interval hold that. The same follows for the points' distance.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,10 +30,11 @@ from knee_gap_perception.poses import LensPose
 from knee_gap_replay.types import blank
 from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.truth import SceneTruth
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import GapStatus
+from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
@@ -42,12 +45,39 @@ POSITION_ERROR = float(np.hypot(0.0367e-3, 0.2 * np.radians(0.004)) / np.sqrt(3)
 ROTATION_ERROR = float(np.radians(0.004) / np.sqrt(3))
 
 
+class Judged(NamedTuple):
+    """One number with its bounds and its interval, beside its truth [m]."""
+
+    value: float
+    minimum: float
+    maximum: float
+    low: float
+    high: float
+    truth: float
+
+
+def judged_line(judged: Sequence[Judged]) -> str:
+    """How many, their errors, and the shares whose bounds and interval hold the truth."""
+    if not judged:
+        return "valid 0"
+    value, minimum, maximum, low, high, truth = np.array(judged).T
+    return (
+        f"valid {len(judged)}  error {1e3 * np.median(np.abs(value - truth)):.3f} mm  "
+        f"bias {1e3 * np.median(value - truth):+.3f} mm  "
+        f"min <= truth {100 * np.mean(minimum <= truth):.1f} %  "
+        f"truth <= max {100 * np.mean(truth <= maximum):.1f} %, "
+        f"{1e3 * np.median(maximum - minimum):.2f} mm wide  "
+        f"in the interval {100 * np.mean((low <= truth) & (truth <= high)):.1f} %, "
+        f"{1e3 * np.median(high - low):.2f} mm wide"
+    )
+
+
 @dataclass
 class Scores:
     """What the images of one scope, or of many, add up to.
 
-    `rms` holds one track's root mean square along and across the edge and over all [rad]; `gaps` a valid
-    estimate's error [m], whether the bounds and the interval hold the truth, and the interval's width [m].
+    `rms` holds one track's root mean square along and across the edge and over all [rad]; `gaps` the valid
+    estimates beside the true instrument gap, `distances` the same of the distance of the points.
     """
 
     along: list[float] = field(default_factory=list)
@@ -58,12 +88,24 @@ class Scores:
     bound: list[float] = field(default_factory=list)
     dice: list[float] = field(default_factory=list)
     held: list[bool] = field(default_factory=list)
-    gaps: list[tuple[float, bool, bool, float]] = field(default_factory=list)
+    gaps: list[Judged] = field(default_factory=list)
+    distances: list[Judged] = field(default_factory=list)
     tracks: int = 0
 
     def add(self, other: "Scores") -> None:
         """Take in the images of another scope."""
-        for name in ("along", "across", "rms", "nees", "covered", "bound", "dice", "held", "gaps"):
+        for name in (
+            "along",
+            "across",
+            "rms",
+            "nees",
+            "covered",
+            "bound",
+            "dice",
+            "held",
+            "gaps",
+            "distances",
+        ):
             getattr(self, name).extend(getattr(other, name))
         self.tracks += other.tracks
 
@@ -84,31 +126,29 @@ class Scores:
             return float(np.median(values)) if values else float("nan")
 
         along, across, both = (np.degrees(median([track[k] for track in self.rms])) for k in range(3))
-        errors = [abs(error) for error, *_ in self.gaps]
         return (
             f"Dice {mean(self.dice):.3f}  rms {both:.2f} deg (along {along:.2f}, across {across:.2f})  "
             f"bound {np.degrees(median(self.bound)):.2f} deg holds {100 * mean(self.covered):.1f} %  "
             f"NEES {mean(self.nees):.2f}  held {100 * mean(self.held):.0f} %  tracks {self.tracks}  |  "
-            f"gap valid {len(self.gaps)}  error {1e3 * median(errors):.3f} mm  "
-            f"in [min, max] {100 * mean([gap[1] for gap in self.gaps]):.1f} %  "
-            f"in the interval {100 * mean([gap[2] for gap in self.gaps]):.1f} %, "
-            f"{1e3 * median([gap[3] for gap in self.gaps]):.2f} mm wide"
+            f"gap {judged_line(self.gaps)}  |  points {judged_line(self.distances)}"
         )
 
 
 class GapCheck:
-    """The estimator behind the edges, and the true distance of the points of every track."""
+    """The estimator behind the edges, with the true gap at each image and the points' true distance."""
 
-    def __init__(self) -> None:
-        self._estimator = GapEstimator(EXACT)
+    def __init__(self, truth: SceneTruth) -> None:
+        self._estimator, self._scene = GapEstimator(EXACT), truth
         self._truth: dict[int, float] = {}
+        self._looked_at: dict[int, tuple[Array, GapEdges]] = {}
 
     def begin(self, track_id: int, points: Array) -> None:
         """Note the true points (2, 3) [m] of a track."""
         self._truth[track_id] = float(np.linalg.norm(points[1] - points[0]))
 
-    def add(self, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
+    def add(self, frame: BenchFrame, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
         """Hand an image's edges and pose to the estimator, as messages, and score what comes out."""
+        self._looked_at[edges.stamp_ns] = frame.T_world_lens, edges
         posed = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), pose)
         seen = fill_gap_edges(
             blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
@@ -117,11 +157,33 @@ class GapCheck:
         estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
         estimates += self._estimator.add_edges(messages.edges_from_message(seen), now)
         for estimate in estimates:
-            truth = self._truth.get(estimate.track_id, np.nan)
-            if estimate.status is GapStatus.VALID and np.isfinite(truth):
-                low, high = estimate.confidence_min, estimate.confidence_max
-                bounded = estimate.gap_min <= truth <= estimate.gap_max
-                scores.gaps.append((estimate.gap - truth, bounded, low <= truth <= high, high - low))
+            if estimate.status is GapStatus.VALID:
+                self._judge(estimate, scores)
+
+    def _judge(self, estimate: GapEstimate, scores: Scores) -> None:
+        """Add one valid estimate; a truth that is not known counts as not held."""
+        T_world_lens, edges = self._looked_at[estimate.stamp_ns]
+        seen = edges.section.bearings if edges.section.seen else np.full((2, 3), np.nan)
+        scores.gaps.append(
+            Judged(
+                estimate.gap,
+                estimate.gap_min,
+                estimate.gap_max,
+                estimate.confidence_min,
+                estimate.confidence_max,
+                self._scene.reported_gap(T_world_lens, seen, edges.pixels),
+            )
+        )
+        scores.distances.append(
+            Judged(
+                estimate.point_distance,
+                estimate.point_distance_min,
+                estimate.point_distance_max,
+                estimate.point_distance_confidence_min,
+                estimate.point_distance_confidence_max,
+                self._truth.get(estimate.track_id, np.nan),
+            )
+        )
 
 
 def lens_pose(frame: BenchFrame) -> LensPose:
@@ -138,7 +200,7 @@ def score(bench: Bench, *, posed: bool, keep: Path | None = None) -> Scores:
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
-    detector, scores, check, track, points = GapEdgeDetector(), Scores(), GapCheck(), 0, None
+    detector, scores, check, track, points = GapEdgeDetector(), Scores(), GapCheck(bench.truth), 0, None
     for frame in frames_of(bench, keep):
         pose = lens_pose(frame)
         edges = detector.process(frame.stamp_ns, frame.image, camera, pose if posed else None)
@@ -149,7 +211,7 @@ def score(bench: Bench, *, posed: bool, keep: Path | None = None) -> Scores:
             track, points = edges.track_id, bench.points(frame, edges.pixels)
             scores.tracks += 1
             check.begin(track, points.points)
-        check.add(pose, edges, scores)
+        check.add(frame, pose, edges, scores)
         if points is None:
             continue
         sightings = bench.follow(points, frame, edges=False)

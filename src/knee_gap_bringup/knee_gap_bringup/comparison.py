@@ -1,7 +1,8 @@
 """What a simulated recording gave, beside its truth."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_replay.bag import BagReader
 from knee_gap_simulation.recording import LENS_POSE_TRUE
-from knee_gap_simulation.rigid import from_parts
+from knee_gap_simulation.rigid import FloatArray, from_parts
 from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
 from knee_gap_uncertainty.gap_estimate import GapStatus
 from knee_gap_uncertainty.messages import stamp_ns
@@ -18,43 +19,98 @@ Floats = npt.NDArray[np.float64]
 EDGES = "/knee_gap/gap_edges"
 GAP = "/knee_gap/gap"
 
+_EDGE_SEEN = 1  # knee_gap_msgs/GapEdges
 
-class Comparison(NamedTuple):
+
+@dataclass(frozen=True)
+class Comparison:
     """Every estimate beside the truth; each array has one entry an estimate; metres, NaN if unknown.
 
-    `time` [s] counts from the first estimate; `truth` is the distance of the two surface points that the
-    track's first image showed at its pixels.
+    `time` [s] counts from the first estimate. `truth` is the instrument gap of the section whose edges the
+    estimate's image gave; where it did not give both, of the section through the middle between its tracked
+    points. `point_truth` is the distance of the two surface points that the track's first image showed at
+    its pixels. The other fields are those of the same name of knee_gap_msgs/GapEstimate.
     """
 
     time: Floats
     valid: npt.NDArray[np.bool_]
+    truth: Floats
+    point_truth: Floats
     gap: Floats
     gap_min: Floats
     gap_max: Floats
     confidence_min: Floats
     confidence_max: Floats
+    point_distance: Floats
+    point_distance_min: Floats
+    point_distance_max: Floats
+    point_distance_confidence_min: Floats
+    point_distance_confidence_max: Floats
     snr: Floats
     baseline: Floats
-    truth: Floats
 
     @property
     def median_error(self) -> float:
         """Median of |gap - truth| over the valid estimates [m]."""
-        errors = np.abs(self.gap - self.truth)[self.valid]
-        return float(np.median(errors)) if errors.size else float("nan")
+        return self._median(np.abs(self.gap - self.truth))
+
+    @property
+    def median_point_error(self) -> float:
+        """Median of |point_distance - point_truth| over the valid estimates [m]."""
+        return self._median(np.abs(self.point_distance - self.point_truth))
+
+    @property
+    def median_width(self) -> float:
+        """Median of gap_max - gap_min over the valid estimates [m]."""
+        return self._median(self.gap_max - self.gap_min)
 
     @property
     def inside(self) -> float:
         """Share of the valid estimates whose [gap_min, gap_max] holds the truth [-]."""
-        held = (self.gap_min <= self.truth) & (self.truth <= self.gap_max)
-        return float(np.mean(held[self.valid])) if self.valid.any() else float("nan")
+        return self._share((self.gap_min <= self.truth) & (self.truth <= self.gap_max))
+
+    @property
+    def above_minimum(self) -> float:
+        """Share of the valid estimates whose gap_min is not above the truth [-]."""
+        return self._share(self.gap_min <= self.truth)
+
+    @property
+    def below_maximum(self) -> float:
+        """Share of the valid estimates whose gap_max is not below the truth [-]."""
+        return self._share(self.truth <= self.gap_max)
+
+    @property
+    def in_interval(self) -> float:
+        """Share of the valid estimates whose confidence interval holds the truth [-]."""
+        return self._share((self.confidence_min <= self.truth) & (self.truth <= self.confidence_max))
+
+    @property
+    def points_inside(self) -> float:
+        """Share of the valid estimates whose bounds of the points' distance hold its truth [-]."""
+        low, high = self.point_distance_min, self.point_distance_max
+        return self._share((low <= self.point_truth) & (self.point_truth <= high))
 
     def summary(self) -> str:
         """One line: how many, how many valid, how far from the truth."""
         return (
             f"{len(self.time)} estimates, {int(self.valid.sum())} valid, median |gap - truth| "
-            f"{1e3 * self.median_error:.3f} mm, truth inside [min, max] {100 * self.inside:.1f} %"
+            f"{1e3 * self.median_error:.3f} mm, truth inside [min, max] {100 * self.inside:.1f} % "
+            f"(min holds {100 * self.above_minimum:.1f} %, width {1e3 * self.median_width:.2f} mm); "
+            f"points {1e3 * self.median_point_error:.3f} mm, in bounds {100 * self.points_inside:.1f} %"
         )
+
+    def _median(self, values: Floats) -> float:
+        chosen = values[self.valid]
+        return float(np.median(chosen)) if chosen.size else float("nan")
+
+    def _share(self, held: npt.NDArray[np.bool_]) -> float:
+        # An unknown truth counts as not held.
+        return float(np.mean(held[self.valid])) if self.valid.any() else float("nan")
+
+
+# What is not read from the estimate under its own name.
+_FOUND = ("time", "valid", "truth", "point_truth")
+_READ = tuple(entry.name for entry in fields(Comparison) if entry.name not in _FOUND)
 
 
 def compare(recording: Path, output: Path) -> Comparison:
@@ -62,53 +118,85 @@ def compare(recording: Path, output: Path) -> Comparison:
 
     Raises BagError for a bag that cannot be read and SimulationError for one that is not simulated.
     """
-    truths = _truth_by_track(recording, output)
-    rows = []
+    truths = _Truths(recording, output)
+    columns: dict[str, list[float]] = {entry.name: [] for entry in fields(Comparison) if entry.name != "time"}
+    stamps: list[int] = []
     with BagReader(output) as bag:
         for entry in bag.messages([GAP]):
             estimate = bag.deserialize(entry)
-            rows.append(
-                (
-                    stamp_ns(estimate.header) * 1e-9,
-                    estimate.status == GapStatus.VALID,
-                    estimate.gap,
-                    estimate.gap_min,
-                    estimate.gap_max,
-                    estimate.confidence_min,
-                    estimate.confidence_max,
-                    estimate.snr,
-                    estimate.baseline,
-                    truths.get(int(estimate.track_id), np.nan),
-                )
+            stamp = stamp_ns(estimate.header)
+            stamps.append(stamp)
+            columns["valid"].append(estimate.status == GapStatus.VALID)
+            columns["truth"].append(truths.instrument_gap(stamp))
+            columns["point_truth"].append(truths.point_distance(int(estimate.track_id)))
+            for name in _READ:
+                columns[name].append(getattr(estimate, name))
+    arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+    valid = arrays.pop("valid").astype(bool)
+    # Counted from the first while they are whole numbers: seconds since 1970 are no better than 0.2 us.
+    first = min(stamps, default=0)
+    time = np.array([1e-9 * (stamp - first) for stamp in stamps])
+    return Comparison(time=time, valid=valid, **arrays)
+
+
+class _Truths:
+    """The truth of a recording at the stamps of its images, of what an output says it looked at."""
+
+    def __init__(self, recording: Path, output: Path) -> None:
+        with BagReader(recording) as bag:
+            self._scene = scene_from_metadata(bag.metadata)
+            self._poses: dict[int, FloatArray] = {}
+            for entry in bag.messages([LENS_POSE_TRUE]):
+                pose = bag.deserialize(entry)
+                self._poses[stamp_ns(pose.header)] = _matrix(pose.pose)
+        self._edges: dict[int, Any] = {}
+        self._points: dict[int, float] = {}
+        self._gaps: dict[int, float] = {}
+        with BagReader(output) as bag:
+            for entry in bag.messages([EDGES]):
+                edges = bag.deserialize(entry)
+                stamp = stamp_ns(edges.header)
+                if not edges.track_id or stamp not in self._poses:
+                    continue
+                self._edges[stamp] = edges
+                if edges.track_id not in self._points:
+                    self._points[int(edges.track_id)] = true_point_distance(
+                        self._scene, self._poses[stamp], edges
+                    )
+
+    def point_distance(self, track_id: int) -> float:
+        """True distance [m] of the two surface points that a track chose; NaN if unknown."""
+        return self._points.get(track_id, float("nan"))
+
+    def instrument_gap(self, stamp: int) -> float:
+        """True instrument gap [m] at the section of the image of a stamp [ns]; NaN if unknown."""
+        if stamp not in self._gaps:
+            edges = self._edges.get(stamp)
+            self._gaps[stamp] = (
+                float("nan") if edges is None else true_gap(self._scene, self._poses[stamp], edges)
             )
-    columns = np.array(rows, dtype=np.float64).reshape(-1, 10).T
-    time = columns[0] - columns[0].min(initial=np.inf) if rows else columns[0]
-    return Comparison(time, columns[1].astype(bool), *columns[2:])
+        return self._gaps[stamp]
 
 
-def _truth_by_track(recording: Path, output: Path) -> dict[int, float]:
-    """True distance [m] of the two surface points that each track chose, by track_id."""
-    with BagReader(recording) as bag:
-        scene = scene_from_metadata(bag.metadata)
-        poses = {}
-        for entry in bag.messages([LENS_POSE_TRUE]):
-            pose = bag.deserialize(entry)
-            poses[stamp_ns(pose.header)] = pose.pose
-    truths: dict[int, float] = {}
-    with BagReader(output) as bag:
-        for entry in bag.messages([EDGES]):
-            edges = bag.deserialize(entry)
-            stamp = stamp_ns(edges.header)
-            if edges.track_id and edges.track_id not in truths and stamp in poses:
-                truths[edges.track_id] = true_gap(scene, poses[stamp], edges)
-    return truths
+def true_gap(scene: SceneTruth, T_world_lens: FloatArray, edges: Any) -> float:
+    """True instrument gap [m] at the section of a GapEdges message, seen from a true lens pose (4, 4).
+
+    Where it does not give both edges, the section leads through the middle between its tracked points. NaN
+    where that is not in the opening.
+    """
+    bearings = np.array([[edge.x, edge.y, edge.z] for edge in (edges.edge_0, edges.edge_1)])
+    if not edges.edge_state_0 == edges.edge_state_1 == _EDGE_SEEN:
+        bearings[:] = np.nan
+    return scene.reported_gap(T_world_lens, bearings, np.array([edges.pixel_0, edges.pixel_1]))
 
 
-def true_gap(scene: SceneTruth, pose: object, edges: object) -> float:
-    """Distance [m] of the surface points behind the two pixels of `edges`, seen from the true lens `pose`."""
-    p, q = pose.position, pose.orientation  # type: ignore[attr-defined]
-    rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T_world_lens = from_parts(rotation, [p.x, p.y, p.z])
-    pixels = np.array([edges.pixel_0, edges.pixel_1])  # type: ignore[attr-defined]
-    points = scene.surface_points(T_world_lens, pixels)
+def true_point_distance(scene: SceneTruth, T_world_lens: FloatArray, edges: Any) -> float:
+    """Distance [m] of the surface points behind the pixels of a GapEdges message, from a true lens pose."""
+    points = scene.surface_points(T_world_lens, np.array([edges.pixel_0, edges.pixel_1]))
     return float(np.linalg.norm(points[1] - points[0]))
+
+
+def _matrix(pose: Any) -> FloatArray:
+    """A geometry_msgs/Pose as (4, 4)."""
+    p, q = pose.position, pose.orientation
+    return from_parts(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z])

@@ -9,6 +9,7 @@
             points = bench.points(frame, pixels)      # the surface points behind any pixels (n, 2)
         sightings = bench.follow(points, frame)       # where those same points are now: visibility, pixels,
         ...
+        bench.instrument_gap(frame, edges)    # what an instrument meets between edges (2, 3) of the frame
 
 Everything may be set one by one: ``Bench(level=1, hardness={"debris": 3}, gap=0.004, depth=0.010)``;
 ``gap=None`` gives a closed joint, in which there is no gap to be found. What is not given is drawn from the
@@ -32,6 +33,7 @@ from knee_gap_simulation.clocks import stamp_ns, tracker_times
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import Conditions, Hardness, conditions
 from knee_gap_simulation.imaging import ByteImage, FloatImage, decoded, jpeg
+from knee_gap_simulation.instrument_gap import InstrumentGap
 from knee_gap_simulation.knee import KneeScene
 from knee_gap_simulation.knee_camera import KneeCamera, KneeLight
 from knee_gap_simulation.knee_truth import Sightings, SurfacePoints, follow, surface_points
@@ -42,6 +44,7 @@ from knee_gap_simulation.probe import Probe
 from knee_gap_simulation.rigid import FloatArray, from_parts
 from knee_gap_simulation.scope import Scope
 from knee_gap_simulation.tracker import track_lens, world_from_scene
+from knee_gap_simulation.truth import SceneTruth
 
 # Nearer than this to any surface [m] no scope gets.
 LEAST_CLEARANCE = 0.0006
@@ -195,6 +198,16 @@ class Bench:
             self.scene, self.lens, self.T_world_scene, frame.T_world_lens, frame.probe, pixels
         )
 
+    def instrument_gap(self, frame: BenchFrame, edge_bearings: npt.ArrayLike) -> InstrumentGap:
+        """The instrument gap between two edges (2, 3) of a frame, unit vectors of the lens, in the world."""
+        return self.truth.instrument_gap(frame.T_world_lens, edge_bearings)
+
+    def edges_at_section(
+        self, frame: BenchFrame, pixel: npt.ArrayLike, across_direction: npt.ArrayLike | None = None
+    ) -> FloatArray:
+        """True bearings (2, 3) of the edges of a frame at the section through a pixel, as in `SceneTruth`."""
+        return self.truth.edges_at_section(frame.T_world_lens, pixel, across_direction)
+
     def follow(self, points: SurfacePoints, frame: BenchFrame, *, edges: bool = True) -> Sightings:
         """Where surface points are in a frame, whether they are seen, and the nearest edge of the gap.
 
@@ -210,6 +223,15 @@ class Bench:
             points,
             edges=edges,
         )
+
+    def pose(self, time_s: float) -> FloatArray:
+        """``T_scene_lens`` (4, 4), the true pose of the lens in the scene, at a time [s]."""
+        return self._motion.poses(np.array(time_s))
+
+    @property
+    def truth(self) -> SceneTruth:
+        """The truth of the knee for any true lens pose, its sections and instrument gaps among it."""
+        return SceneTruth(self.scene, self.T_world_scene, self.lens, self.scope, self.probe)
 
     def tracked_body_poses(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times (n,) [s] at 120 Hz, reported body poses and true lens poses (n, 4, 4) in the world."""

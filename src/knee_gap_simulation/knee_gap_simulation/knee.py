@@ -17,6 +17,7 @@ from knee_gap_simulation import knee_field as fields
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_field import CAPSULE, CONDYLE, MENISCUS, PLATEAU, PROBE
 from knee_gap_simulation.rigid import FloatArray
+from knee_gap_simulation.tissue_samples import TissueSamples, knee_samples
 
 KIND = "knee"
 NO_PROBE = np.zeros((0, 4))
@@ -29,6 +30,8 @@ NEAREST_WITHIN = 0.006
 CLOSED = -0.0012
 # What is seen deeper than this behind the rim is seen through the gap.
 _BEHIND = 0.0035
+# How far from the middle of the gap [m] an edge of it is looked for.
+_EDGE_WITHIN = 0.018
 
 Vector = tuple[float, float, float]
 Wave = tuple[float, float, float, float, float, float]
@@ -228,6 +231,40 @@ class KneeScene:
         fields.ridge_points(places, self.constants(), self.wave_array(), result)
         return result
 
+    def tissue_samples(self, centre: FloatArray, reach: float) -> TissueSamples:
+        """Points on condyle, plateau, meniscus and capsule within ``reach`` [m] of a centre (3,)."""
+        return knee_samples(self.constants(), self.wave_array(), centre, reach)
+
+    def contact(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
+        """Point (3,) that a line of sight along an edge of the gap touches: of the rim or of the condyle.
+
+        Where the line misses or cuts the tissue, the point of that side's surface where it comes closest.
+        """
+        along = np.linspace(-_EDGE_WITHIN, _EDGE_WITHIN, 2001)
+        off = _angles_off(origin, direction, self.ridge(along))
+        index = int(np.argmin(off))
+        step = float(along[1] - along[0])
+        place = minimize_scalar(
+            lambda x: _angles_off(origin, direction, self.ridge(float(x)))[0],
+            bounds=(along[index] - step, along[index] + step),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        reached = np.linspace(1e-3, 0.03, 600)
+        depths = self.distance(origin + reached[:, None] * direction, CONDYLE)
+        index = int(np.argmin(depths))
+        nearest = minimize_scalar(
+            lambda t: float(self.distance(origin + t * direction, CONDYLE)[0]),
+            bounds=(reached[max(0, index - 1)], reached[min(len(reached) - 1, index + 1)]),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        if abs(nearest.fun) / nearest.x < place.fun:
+            foot = np.empty(3)
+            fields.foot_on_condyle(origin + nearest.x * direction, self.constants(), self.wave_array(), foot)
+            return foot
+        return np.asarray(self.ridge(float(place.x))[0])
+
     def nearest_distance(self) -> tuple[float, FloatArray, FloatArray]:
         """Smallest distance between the condyle and the tissue below it, and the points (3,) where it is.
 
@@ -267,6 +304,13 @@ class KneeScene:
             x, y, z = scene.condyle_centre
             scene = replace(scene, condyle_centre=(x, y - excess, z))
         return scene
+
+
+def _angles_off(origin: FloatArray, direction: FloatArray, points: FloatArray) -> FloatArray:
+    """Angles (n,) [rad] between a line of sight and points (n, 3)."""
+    away = points - origin
+    along = away @ direction
+    return np.asarray(np.arctan2(np.linalg.norm(away - along[:, None] * direction, axis=1), along))
 
 
 def _waves(rng: np.random.Generator, roughness: float) -> tuple[Wave, ...]:

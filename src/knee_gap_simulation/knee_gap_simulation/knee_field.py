@@ -35,7 +35,8 @@ def _sine(cycles: float) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _ripple(x: float, y: float, z: float, surface: int, shape: FloatArray, waves: FloatArray) -> float:
+def ripple(x: float, y: float, z: float, surface: int, shape: FloatArray, waves: FloatArray) -> float:
+    """Sum of the sine waves of a surface [m]."""
     total = 0.0
     for k in range(int(shape[WAVES + surface]), int(shape[WAVES + surface + 1])):
         total += waves[k, 1] * _sine(waves[k, 2] * x + waves[k, 3] * y + waves[k, 4] * z + waves[k, 5])
@@ -58,7 +59,7 @@ def condyle(x: float, y: float, z: float, shape: FloatArray, waves: FloatArray) 
     distance = _ellipsoid(x, y, z, shape, 0)
     if distance > 2e-3:
         return distance - 0.6e-3
-    return distance - _ripple(x, y, z, CONDYLE, shape, waves)
+    return distance - ripple(x, y, z, CONDYLE, shape, waves)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -72,7 +73,7 @@ def plateau(x: float, y: float, z: float, shape: FloatArray, waves: FloatArray) 
     distance = float((surface - y) / np.sqrt(1.0 + slope_x * slope_x + slope_z * slope_z))
     if distance > 2e-3:
         return distance - 0.6e-3
-    return distance - _ripple(x, y, z, PLATEAU, shape, waves)
+    return distance - ripple(x, y, z, PLATEAU, shape, waves)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -108,13 +109,13 @@ def meniscus(x: float, y: float, z: float, shape: FloatArray, waves: FloatArray)
     top = slope * before - hollow * before * before - below
     if before > 0.0:
         # The ripples fade towards the rim, which stays where `ridge` has it.
-        top -= _ripple(x, 0.0, z, MENISCUS, shape, waves) * before / (before + 0.5e-3)
+        top -= ripple(x, 0.0, z, MENISCUS, shape, waves) * before / (before + 0.5e-3)
     along = rim_dy + falls * rim_dz
     top /= np.sqrt(1.0 + falls * falls + along * along)
     back = undercut * below - before
     along = undercut * rim_dy + rim_dz
     back /= np.sqrt(1.0 + undercut * undercut + along * along)
-    edge = before - width + _ripple(x, 0.0, 0.0, FREE_EDGE, shape, waves)
+    edge = before - width + ripple(x, 0.0, 0.0, FREE_EDGE, shape, waves)
     return float(max(top, back, edge / np.sqrt(1.2 + 0.5 * rim_dz * rim_dz)))
 
 
@@ -124,7 +125,7 @@ def capsule(x: float, y: float, z: float, shape: FloatArray, waves: FloatArray) 
     distance = -_ellipsoid(x, y, z, shape, 6)
     if distance > 3e-3:
         return distance - 1.5e-3
-    return 0.75 * (distance - _ripple(x, y, z, CAPSULE, shape, waves))
+    return 0.75 * (distance - ripple(x, y, z, CAPSULE, shape, waves))
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

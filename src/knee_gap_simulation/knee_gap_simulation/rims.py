@@ -17,9 +17,20 @@ import numpy.typing as npt
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.rigid import FloatArray
 from knee_gap_simulation.textures import FloatImage, Tissue, tissue_texture
+from knee_gap_simulation.tissue_samples import (
+    LOWER_SIDE,
+    RIM_SPACING,
+    SPACING,
+    UPPER_SIDE,
+    TissueSamples,
+    joined,
+    steps,
+)
 
 KIND = "rims"
 UPPER, LOWER, WALL = 0, 1, 2
+# How far from the middle of the gap [m] an edge of it is looked for.
+_EDGE_WITHIN = 0.018
 
 _TISSUES = (
     Tissue((232, 214, 196), (226, 170, 150), 0.35, mottle=0.07, grain=0.09, fibres=0.03, vessels=8),
@@ -118,6 +129,35 @@ class RimScene:
             rims.append(np.stack([along, y, z], axis=-1))
         return rims[0], rims[1]
 
+    def tissue_samples(self, centre: FloatArray, reach: float) -> TissueSamples:
+        """Points on both leaves and along their rims within ``reach`` [m] of a centre (3,)."""
+        rims = self.rim(steps(centre[0] - reach, centre[0] + reach, RIM_SPACING))
+        parts = [(UPPER_SIDE, rims[0]), (LOWER_SIDE, rims[1])]
+        along = steps(centre[0] - reach, centre[0] + reach, SPACING)
+        outward = steps(0.0, reach, SPACING)
+        for side, sign, edge in zip((UPPER, LOWER), (-1.0, 1.0), self.rim(along), strict=True):
+            flat = np.stack(np.broadcast_arrays(along[:, None], edge[:, 1:2] + sign * outward), axis=-1)
+            leaf = np.empty((flat.shape[0] * flat.shape[1], 3))
+            leaf[:, :2] = flat.reshape(-1, 2)
+            _lift(leaf, side, self._constants(), np.array(self.waves))
+            parts.append((UPPER_SIDE if side == UPPER else LOWER_SIDE, leaf))
+        return joined(parts, centre, reach)
+
+    def contact(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
+        """Point (3,) of a rim that a line of sight touches: where it comes closest to one."""
+        begin, end = -_EDGE_WITHIN, _EDGE_WITHIN
+        for _ in range(4):
+            along = np.linspace(begin, end, 601)
+            found = []
+            for rim in self.rim(along):
+                away = rim - origin
+                far = away @ direction
+                off = np.linalg.norm(away - far[:, None] * direction, axis=1) / far
+                found.append((float(off.min()), int(off.argmin()), rim[off.argmin()]))
+            _, index, point = min(found, key=lambda pair: pair[0])
+            begin, end = along[max(0, index - 2)], along[min(len(along) - 1, index + 2)]
+        return np.asarray(point)
+
     def looks_into_gap(self, T_scene_lens: FloatArray, bearings: FloatArray) -> npt.NDArray[np.bool_]:
         """Whether bearings (n, 3) of a lens look into the gap."""
         directions = np.ascontiguousarray(bearings @ T_scene_lens[:3, :3].T)
@@ -158,6 +198,13 @@ def _height(
             dz_dx += waves[k, 2] * change
             dz_dy += waves[k, 3] * change
     return z, dz_dx, dz_dy
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lift(points: FloatArray, side: int, constants: FloatArray, waves: FloatArray) -> None:
+    """Set the heights z of points (n, 3) so that they lie on a leaf."""
+    for i in range(points.shape[0]):
+        points[i, 2] = _height(points[i, 0], points[i, 1], side, constants, waves)[0]
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from knee_gap_simulation.clocks import seconds
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.instrument_gap import CONE, InstrumentGap
 from knee_gap_simulation.knee import KIND as KNEE
 from knee_gap_simulation.knee import KneeScene
 from knee_gap_simulation.lens import Lens
@@ -19,8 +20,17 @@ from knee_gap_simulation.rigid import FloatArray, inverse
 from knee_gap_simulation.rims import KIND as RIMS
 from knee_gap_simulation.rims import RimScene
 from knee_gap_simulation.scope import Scope
+from knee_gap_simulation.section_truth import (
+    SectionTruth,
+    edges_at_section,
+    section_truth,
+    true_instrument_gap,
+)
 
 METADATA_KEY = "knee_gap_simulation"
+
+# Where between two points of the sides the opening is looked for.
+_ALONG_SECTION = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,62 @@ class SceneTruth:
         else:
             mask[seen] = self.scene.looks_into_gap(T_scene_lens, bearings[seen])
         return mask
+
+    def instrument_gap(
+        self, T_world_lens: npt.ArrayLike, edge_bearings: npt.ArrayLike, *, cone: float = CONE
+    ) -> InstrumentGap:
+        """The instrument gap of the section between two edges (2, 3), unit vectors in the lens frame.
+
+        Seen from a true lens pose (4, 4); the axis is in the world [m]. ``cone`` is the half angle [rad] of
+        the directions about that of view, 0 for the view only. Raises SimulationError for edges that are
+        not finite or bound no gap.
+        """
+        found = true_instrument_gap(self.scene, self._lens_in_scene(T_world_lens), edge_bearings, cone=cone)
+        return found.moved(self.T_world_scene)
+
+    def reported_gap(
+        self, T_world_lens: npt.ArrayLike, edge_bearings: npt.ArrayLike, pixels: npt.ArrayLike
+    ) -> float:
+        """The instrument gap [m] at the section that an image's edges (2, 3) report.
+
+        Where they are NaN it is the section through the middle between two points of the sides, at pixels
+        (2, 2) [px] of the image. NaN where there is no opening between those either, and for edges that
+        bound no gap.
+        """
+        bearings = np.asarray(edge_bearings, dtype=np.float64).reshape(2, 3)
+        ends = np.asarray(pixels, dtype=np.float64).reshape(2, 2)
+        if not np.isfinite(bearings).all() and np.isfinite(ends).all():
+            for share in _ALONG_SECTION:
+                at = ends[0] + share * (ends[1] - ends[0])
+                bearings = self.edges_at_section(T_world_lens, at, ends[1] - ends[0])
+                if np.isfinite(bearings).all():
+                    break
+        if not np.isfinite(bearings).all():
+            return float("nan")
+        try:
+            return self.instrument_gap(T_world_lens, bearings).diameter
+        except SimulationError:
+            return float("nan")
+
+    def section(self, T_world_lens: npt.ArrayLike, edge_bearings: npt.ArrayLike) -> SectionTruth:
+        """All that is true of the section between two edges (2, 3), seen from a true lens pose."""
+        found = section_truth(self.scene, self._lens_in_scene(T_world_lens), edge_bearings)
+        return found.moved(self.T_world_scene)
+
+    def edges_at_section(
+        self,
+        T_world_lens: npt.ArrayLike,
+        pixel: npt.ArrayLike,
+        across_direction: npt.ArrayLike | None = None,
+    ) -> FloatArray:
+        """True bearings (2, 3) of the edges on the line across the opening through a pixel (2,) in it [px].
+
+        ``across_direction`` (2,) in the image; without it that in which the opening is narrowest. NaN if the
+        pixel does not look into the gap, or the line leaves the field of view before it meets an edge.
+        """
+        return edges_at_section(
+            self.scene, self.lens, self._lens_in_scene(T_world_lens), pixel, across_direction
+        )
 
     def as_metadata(self, **more: Any) -> dict[str, str]:
         """Metadata of a bag from which `scene_from_metadata` makes this truth again."""
