@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "knee_gap_perception": {"knee_gap_msgs", "knee_gap_node"},
     "knee_gap_uncertainty": {"knee_gap_msgs", "knee_gap_node"},
     "knee_gap_replay": {"knee_gap_msgs", "knee_gap_node", "knee_gap_perception", "knee_gap_uncertainty"},
-    "knee_gap_simulation": {"knee_gap_msgs", "knee_gap_replay"},
+    "knee_gap_simulation": {"knee_gap_msgs", "knee_gap_node", "knee_gap_replay"},
     "knee_gap_bringup": {
         "knee_gap_msgs",
         "knee_gap_node",
