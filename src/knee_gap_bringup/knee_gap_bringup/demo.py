@@ -1,6 +1,5 @@
 """The demo: a bag, in real time, through three live nodes over DDS, and what they said beside the truth."""
 
-import argparse
 import os
 import shutil
 import signal
@@ -14,6 +13,7 @@ from knee_gap_bringup.gap_plot import write_gap_plot
 from knee_gap_bringup.launch_plan import DRAIN, NODES
 from knee_gap_bringup.processes import Processes, StartError, executable
 from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
+from knee_gap_node.command_line import Parser, finite
 from knee_gap_replay.bag import BagReader
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.errors import SimulationError
@@ -103,14 +103,16 @@ def run(bag: Path, out: Path, rate: float) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the demo; 0 when it ran through."""
-    parser = argparse.ArgumentParser(prog="demo", description=__doc__)
+    parser = Parser(prog="demo", description=__doc__)
     parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="simulated bag to play")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
-    parser.add_argument("--rate", type=float, default=1.0, help="times as fast as recorded")
+    parser.add_argument("--rate", type=finite, default=1.0, help="times as fast as recorded")
     arguments = parser.parse_args(argv)
     # Whoever ends the demo, by Ctrl-C or otherwise, ends its processes with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        if not 0.01 <= arguments.rate <= 100.0:
+            raise StartError(f"--rate must lie in [0.01, 100], not {arguments.rate:g}")
         run(arguments.bag, arguments.out, arguments.rate)
     except StartError as error:
         print(f"demo: {error}", file=sys.stderr)

@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from threadpoolctl import threadpool_limits
 
 from knee_gap_node.errors import ConfigurationError
-from knee_gap_node.parameters import as_rows, declare, refuse_unknown
+from knee_gap_node.parameters import as_rows, declare, refuse_unknown, refused_by_ros, require_files
 from knee_gap_node.seam import Fault, Seam
 
 Parameters = TypeVar("Parameters")
@@ -110,7 +110,8 @@ class BaseNode(GuardedNode):
     """A node whose parameters come from a dataclass and that says once a second how it fares."""
 
     def __init__(self, name: str, *, health: Callable[[], Health]) -> None:
-        super().__init__(name)
+        with refused_by_ros():
+            super().__init__(name)
         self._health = health
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RESULT_QOS)
         self._diagnostics_timer = self.create_timer(1.0, self.publish_diagnostics)
@@ -152,6 +153,7 @@ class BaseNode(GuardedNode):
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     """Start a node, spin until it is told to stop, return the exit code: 2 for a mistake of the user's."""
     try:
+        require_files(sys.argv if argv is None else argv)
         rclpy.init(args=None if argv is None else list(argv))
     except Exception as error:  # rclpy's parser raises several unrelated kinds for a bad --ros-args
         print(f"cannot start: {' '.join(str(error).split())}", file=sys.stderr)

@@ -5,19 +5,24 @@ high) and `choices`. Parameters are read-only: changing a calibration or an erro
 track would make one estimate out of two.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import Field, fields
+from itertools import pairwise
+from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_origin, get_type_hints
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
 from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.user_files import MOST_YAML_BYTES, read_bytes
 
 Parameters = TypeVar("Parameters")
 
 # Every node has these without asking; they are no mistake of the user's.
-ALWAYS_ALLOWED = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+ALWAYS_ALLOWED = frozenset({"use_sim_time", "start_type_description_service"})
+_ALLOWED_GROUP = "qos_overrides."
 
 
 def descriptor_of(field: "Field[Any]", kind: object) -> ParameterDescriptor:
@@ -83,11 +88,34 @@ def refuse_unknown(node: Any, overrides: Iterable[str]) -> None:
 
     """
     unknown = sorted(
-        name for name in overrides if not node.has_parameter(name) and not name.startswith(ALWAYS_ALLOWED)
+        name for name in overrides if not node.has_parameter(name) and not _is_always_allowed(name)
     )
     if unknown:
-        known = sorted(name for name in node._parameters if not name.startswith(ALWAYS_ALLOWED))
+        known = sorted(name for name in node._parameters if not _is_always_allowed(name))
         raise ConfigurationError(f"no parameter {', '.join(unknown)}; there are: {', '.join(known)}")
+
+
+@contextmanager
+def refused_by_ros() -> Iterator[None]:
+    """Turn what rclpy raises while a node is made, for names and values of its own, into ConfigurationError.
+
+    `use_sim_time:=abc` is such a value: rclpy declares it before any parameter of ours.
+    """
+    try:
+        yield
+    except Exception as error:  # rclpy's own family has no common base but Exception
+        raise ConfigurationError(" ".join(str(error).split())) from error
+
+
+def require_files(arguments: Sequence[str]) -> None:
+    """Raise FileError where `--params-file` names no file: ROS would wait for a FIFO without end."""
+    for option, value in pairwise(arguments):
+        if option == "--params-file":
+            read_bytes(Path(value), MOST_YAML_BYTES)
+
+
+def _is_always_allowed(name: str) -> bool:
+    return name in ALWAYS_ALLOWED or name.startswith(_ALLOWED_GROUP)
 
 
 def _one_line(name: str, field: "Field[Any]", hint: object, error: Exception) -> str:

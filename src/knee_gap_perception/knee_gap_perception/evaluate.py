@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from knee_gap_node.bag_paths import missing_bag
+from knee_gap_node.command_line import Parser
 from knee_gap_perception.calibration.bag_input import CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.camera import Camera, EquiangularCamera, camera_from_info
@@ -49,7 +51,7 @@ def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Ro
         difference = difference_picture(pair.predicted, pair.marked, error)
         folder = out / "difference" / pair.image_set
         folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / f"{pair.name}.png"), difference)
+        _write_picture(folder / f"{pair.name}.png", difference)
         if sum(row.image_set == pair.image_set for row in rows) <= SHEET_ROWS:
             pictures = [] if pair.picture is None else [pair.picture]
             sheet.append(
@@ -130,11 +132,16 @@ def _printed(rows: Sequence[Row]) -> None:
 def _write_sheet(rows: Sequence[Image], path: Path) -> None:
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows]
-    cv2.imwrite(str(path), np.vstack(padded))
+    _write_picture(path, np.vstack(padded))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
+def _write_picture(path: Path, image: Image) -> None:
+    """Write a picture as PNG. Raises OSError where the place does not take it."""
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="evaluate", description=__doc__)
     parser.add_argument("predicted", type=Path, help="folder of predicted masks, or a bag")
     parser.add_argument(
         "marked",
@@ -174,9 +181,10 @@ def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
     if not is_bag(arguments.predicted):
         if arguments.marked is None:
             if not arguments.predicted.is_dir():
-                raise PerceptionError(missing_bag(arguments.predicted))
+                flaw = missing_bag(arguments.predicted) or f"{arguments.predicted} is no bag and no folder"
+                raise PerceptionError(flaw)
             raise PerceptionError(
-                f"{arguments.predicted} is no bag, it has no metadata.yaml: "
+                f"{arguments.predicted} is no bag, it holds no MCAP file: "
                 "name the folder of marked masks as well"
             )
         return folder_pairs(arguments.predicted, arguments.marked, arguments.pictures)
@@ -200,6 +208,7 @@ def _camera(arguments: argparse.Namespace) -> Camera | None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Evaluate; 0 when everything was judged and written."""
     arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="evaluate: %(message)s", stream=sys.stderr)
     try:
         camera = _camera(arguments)
         count, pairs = _pairs(arguments)
@@ -209,6 +218,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (PerceptionError, OSError) as error:
         print(f"evaluate: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("evaluate: stopped before the end", file=sys.stderr)
+        return 130
     _printed(rows)
     print(f"{arguments.out}: table.csv, images.csv, sheet.png, difference/")
     return 0

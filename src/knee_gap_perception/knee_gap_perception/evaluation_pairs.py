@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_node.user_files import FileError, read_bytes, shown
 from knee_gap_perception.calibration.bag_input import CalibrationBag
 from knee_gap_perception.edge_detector import GapEdgeDetector
 from knee_gap_perception.edge_parameters import EdgeParameters
@@ -29,6 +30,7 @@ MaskAt = Callable[[int], Mask | None]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 TRUTH_GROUP = "knee_gap.gap_truth"
 SHEET_ROWS = 8
+MOST_PICTURE_BYTES = 256 << 20
 
 
 class Pair(NamedTuple):
@@ -51,7 +53,7 @@ class BagTopics(NamedTuple):
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a recorded bag rather than a folder of pictures."""
-    return path.suffix == ".mcap" or (path / "metadata.yaml").is_file()
+    return path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
 def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[int, Iterator[Pair]]:
@@ -141,7 +143,7 @@ def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[i
 
 def _files(folder: Path) -> dict[Path, Path]:
     if not folder.is_dir():
-        raise PerceptionError(f"{folder} is no folder")
+        raise PerceptionError(f"{shown(folder)} is no folder")
     return {
         path.relative_to(folder).with_suffix(""): path
         for path in sorted(folder.rglob("*"))
@@ -150,7 +152,11 @@ def _files(folder: Path) -> dict[Path, Path]:
 
 
 def _image(path: Path) -> Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    try:
+        data = np.frombuffer(read_bytes(path, MOST_PICTURE_BYTES), dtype=np.uint8)
+    except FileError as error:
+        raise PerceptionError(str(error)) from None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if image is None:
         raise PerceptionError(f"{path} is no image that can be read")
     return np.asarray(image, dtype=np.uint8)

@@ -1,14 +1,17 @@
 """Tells the tracker's precision (DT and omega) from bags or takes: parameters to paste and a plot."""
 
 import argparse
+import logging
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import degrees, isnan
 from pathlib import Path
 
 import numpy as np
-from rosbags.highlevel import AnyReaderError
 
+from knee_gap_node.bag.bag import BagReader
+from knee_gap_node.bag.errors import BagError
+from knee_gap_node.command_line import Parser, finite
 from knee_gap_perception.calibration.bag_input import opened
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import body_pose_from_message
@@ -17,6 +20,7 @@ from knee_gap_perception.pose_validity import PoseValidity, RefusalReason, Valid
 from knee_gap_perception.poses import BodyPose
 from knee_gap_perception.tracker_precision import ErrorSums, PoseSeries, Precision, pooled, tracker_precision
 
+_LOG = logging.getLogger(__name__)
 POSE_TYPES = ("geometry_msgs/msg/PoseStamped",)
 # The end of a gap is a sound pose; only what is no pose at all is left out.
 HARMLESS = {RefusalReason.GAP}
@@ -48,22 +52,26 @@ def read_bodies(path: Path, topic: str | None, body: str | None, up_axis: str) -
             raise PerceptionError(f"{path.name}: say which rigid body with --body; the take has: {known}")
         name = take.body(body).name if body is not None else take.bodies[0].name
         return [pose for frame in take.frames(1) for pose in frame.bodies if pose.name == name]
-    try:
-        with opened(path) as reader:
-            poses = {item.topic for item in reader.connections if item.msgtype in POSE_TYPES}
-            chosen = topic or next((name for name in sorted(poses) if name.endswith("scope_body/pose")), None)
-            if chosen not in poses:
-                known = ", ".join(sorted(poses)) or "none"
-                raise PerceptionError(
-                    f"{path}: no poses on {chosen or 'scope_body/pose'}; topics with poses: {known}"
-                )
-            connections = [item for item in reader.connections if item.topic == chosen]
-            return [
-                body_pose_from_message(reader.deserialize(data, item.msgtype))
-                for item, _, data in reader.messages(connections)
-            ]
-    except (AnyReaderError, OSError) as error:
-        raise PerceptionError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+    with opened(path) as reader:
+        poses = {name for name, msgtype in reader.topics.items() if msgtype in POSE_TYPES}
+        chosen = topic or next((name for name in sorted(poses) if name.endswith("scope_body/pose")), None)
+        if chosen not in poses:
+            known = ", ".join(sorted(poses)) or "none"
+            raise PerceptionError(
+                f"{path}: no poses on {chosen or 'scope_body/pose'}; topics with poses: {known}"
+            )
+        return list(_readable_poses(reader, chosen))
+
+
+def _readable_poses(reader: BagReader, topic: str) -> Iterator[BodyPose]:
+    """Poses of a topic; one whose bytes are none is told in the log and left out."""
+    for entry in reader.messages([topic]):
+        try:
+            message = reader.deserialize(entry)
+        except BagError as error:
+            _LOG.warning(str(error))
+            continue
+        yield body_pose_from_message(message)
 
 
 def table(precisions: Sequence[Precision]) -> list[str]:
@@ -131,8 +139,8 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f"tracker_precision: {arguments.out / 'tracker_precision.yaml'} and .png written")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="tracker_precision", description=__doc__)
+def _parser() -> Parser:
+    parser = Parser(prog="tracker_precision", description=__doc__)
     add = parser.add_argument
     add("recordings", nargs="+", type=Path, metavar="BAG", help="bags, or takes exported by Motive (.csv)")
     add("--topic", help="of the poses (the one that ends in scope_body/pose)")
@@ -141,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--lever",
         nargs=3,
-        type=float,
+        type=finite,
         metavar=("X", "Y", "Z"),
         help="place of the lens in the body [m] (body_to_shaft_translation): the error is told for the lens",
     )
@@ -152,11 +160,15 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Tell the precision; a mistake is one line."""
     arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="tracker_precision: %(message)s", stream=sys.stderr)
     try:
         _run(arguments)
-    except PerceptionError as error:
+    except (PerceptionError, OSError) as error:
         print(f"tracker_precision: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("tracker_precision: stopped before the end", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -2,48 +2,25 @@
 
 import argparse
 import logging
-import math
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser as Parser
+from knee_gap_node.command_line import finite as finite
+from knee_gap_node.command_line import not_negative as not_negative
+from knee_gap_node.command_line import positive as positive
 from knee_gap_node.errors import ConfigurationError
+from knee_gap_node.user_files import FileError
 from knee_gap_replay.errors import BagError
 
 Item = TypeVar("Item")
 _SECONDS_BETWEEN_LINES = 10.0
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser that tells a mistake in one line, without the usage."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print the mistake and exit with 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
-
-
-def positive(text: str) -> float:
-    """Return a finite number above zero, for `type=` of an argument."""
-    value = not_negative(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError("must be greater than 0, is 0")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Return a finite number of at least zero, for `type=` of an argument."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
-    if not math.isfinite(value) or value < 0:
-        raise argparse.ArgumentTypeError(f"must be a finite number, 0 or more, is {text}")
-    return value
 
 
 def run(
@@ -56,7 +33,7 @@ def run(
     logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
     try:
         return command(arguments)
-    except (BagError, ConfigurationError, OSError) as error:
+    except (BagError, ConfigurationError, FileError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -1,5 +1,3 @@
-"""What goes wrong with bags."""
+"""What goes wrong with bags: see knee_gap_node.bag."""
 
-
-class BagError(ValueError):
-    """A bag, topic, type or command that cannot be used; the message is one line and says why."""
+from knee_gap_node.bag.errors import BagError as BagError

@@ -15,12 +15,14 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.optitrack.motive_csv import Take, TakeBody, read_take
 from knee_gap_perception.optitrack.up_axis import UP_AXES
 from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.command_line import Parser, not_negative, run
+from knee_gap_replay.command_line import Parser, finite, not_negative, run
 from knee_gap_replay.errors import BagError
 from knee_gap_replay.topics import namespace_from
 from knee_gap_replay.types import blank
 
 NANOSECONDS = 1_000_000_000
+# Stamps of ROS count seconds in 31 bits.
+_END_OF_STAMPS = 1 << 31
 POSE = "geometry_msgs/msg/PoseStamped"
 
 
@@ -67,6 +69,8 @@ def _start_ns(take: Take, arguments: argparse.Namespace) -> int:
     if start < 0:
         before = f"{-start / NANOSECONDS:.3f} s before 1970"
         raise BagError(f"the take would start {before}; check --start and --offset")
+    if start + round(float(take.time[-1]) * NANOSECONDS) >= _END_OF_STAMPS * NANOSECONDS:
+        raise BagError("the take would end after 2038, beyond ROS stamps; check --start and --offset")
     return start
 
 
@@ -120,7 +124,7 @@ def _parser() -> Parser:
     parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="of the topics (/knee_gap)")
     parser.add_argument("--topic", help="of the scope's poses (NAMESPACE/scope_body/pose)")
     parser.add_argument("--up-axis", choices=UP_AXES, default="y", help="axis that points up in the take (y)")
-    parser.add_argument("--offset", type=float, default=0.0, metavar="S", help="to add to all stamps [s] (0)")
+    parser.add_argument("--offset", type=finite, default=0.0, metavar="S", help="to add to stamps [s] (0)")
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         "--start", type=not_negative, metavar="S", help="time of the take's start since 1970 [s]"

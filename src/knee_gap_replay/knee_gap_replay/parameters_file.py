@@ -5,9 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_origin, get_type_hints
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
+from knee_gap_node.user_files import FileError, read_yaml
 from knee_gap_replay.errors import BagError
 
 _PARAMETERS = "ros__parameters"
@@ -28,11 +26,9 @@ class ParametersFile:
         if path is None:
             return
         try:
-            tree = YAML(typ="safe").load(path)
-        except OSError as error:
-            raise BagError(f"{path}: {error.strerror}") from None
-        except (YAMLError, UnicodeDecodeError):
-            raise BagError(f"{path} is not a YAML file") from None
+            tree = read_yaml(path)
+        except FileError as error:
+            raise BagError(str(error)) from None
         self._by_node = list(_nodes(tree))
         if not self._by_node:
             raise BagError(f"{path} is not a ROS parameter file: nothing in it is called {_PARAMETERS}")

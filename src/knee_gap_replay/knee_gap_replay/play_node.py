@@ -19,7 +19,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from knee_gap_node.base_node import GuardedNode
-from knee_gap_node.parameters import refuse_unknown
+from knee_gap_node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay import qos as qos_profiles
 from knee_gap_replay.bag import BagReader, Topic
 from knee_gap_replay.command_line import Parser, not_negative, positive, run, stop_on_signals, with_progress
@@ -39,7 +39,8 @@ class PlayNode(GuardedNode):
     """Publishers for the topics of a bag; skips, with one line each, what this machine has no type for."""
 
     def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:
-        super().__init__("play")
+        with refused_by_ros():
+            super().__init__("play")
         refuse_unknown(self, self._parameter_overrides)
         self._publishers_by_topic: dict[str, Publisher] = {}
         for name in sorted(topics):
@@ -168,6 +169,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Play a bag; ROS arguments (--ros-args) are understood as by any node."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
+        require_files(given)
         rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's own exceptions for wrong ROS arguments are not public
         print(f"play: {str(error).splitlines()[0]}", file=sys.stderr)

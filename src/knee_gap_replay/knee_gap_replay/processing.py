@@ -5,6 +5,7 @@ Messages are fed by their header's stamp, none is dropped, and the same bag give
 
 import heapq
 import logging
+import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -17,6 +18,11 @@ _LOG = logging.getLogger(__name__)
 
 # No driver keeps a message back longer than this [ns]; within it, messages are put in order of their stamps.
 MOST_LATENCY_NS = 500_000_000
+# Stamps of two topics this far apart are of two clocks [ns]: one since boot, or without a date.
+_OTHER_CLOCK_NS = 3_600 * 1_000_000_000
+# By so many messages a topic's clock is known, looked for in so long a part of the bag [ns].
+_ENOUGH_MESSAGES = 20
+_CLOCK_SEARCH_NS = 30 * 1_000_000_000
 
 
 class Output(NamedTuple):
@@ -50,7 +56,10 @@ class Pipeline(Protocol):
 
 
 class Stamped(NamedTuple):
-    """A message in the order of stamps; among equal stamps, by the rank of its topic, then as recorded."""
+    """A message in the order of stamps; among equal stamps, by the rank of its topic, then as recorded.
+
+    `stamp_ns` is the header's, by the clock of the other topics where the topic has one of its own.
+    """
 
     stamp_ns: int
     rank: int
@@ -61,8 +70,10 @@ class Stamped(NamedTuple):
 def by_stamp(reader: BagReader, topics: Sequence[str]) -> Iterator[Stamped]:
     """Yield the messages of `topics` by their stamps.
 
-    Where the stamps of a topic run backwards (a recorded loop), what came before is yielded first.
+    Where the stamps of a topic run backwards (a recorded loop), what came before is yielded first. A topic
+    whose stamps are of another clock is put where it was recorded, as it came to the live nodes.
     """
+    shifts = _shifts(reader, topics)
     rank = {topic: index for index, topic in enumerate(topics)}
     newest: dict[str, int] = {}
     waiting: list[Stamped] = []
@@ -75,11 +86,31 @@ def by_stamp(reader: BagReader, topics: Sequence[str]) -> Iterator[Stamped]:
                 yield heapq.heappop(waiting)
             newest.clear()
         newest[message.topic] = max(stamp_ns, newest.get(message.topic, stamp_ns))
-        heapq.heappush(waiting, Stamped(stamp_ns, rank[message.topic], number, message))
+        shifted_ns = stamp_ns + shifts.get(message.topic, 0)
+        heapq.heappush(waiting, Stamped(shifted_ns, rank[message.topic], number, message))
         while waiting[0].message.time_ns < message.time_ns - MOST_LATENCY_NS:
             yield heapq.heappop(waiting)
     while waiting:
         yield heapq.heappop(waiting)
+
+
+def _shifts(reader: BagReader, topics: Sequence[str]) -> dict[str, int]:
+    """What to add to the stamps of each topic of another clock than the first's [ns]; none for the same."""
+    ahead: dict[str, list[int]] = {topic: [] for topic in topics}
+    begin_ns: int | None = None
+    for message in reader.messages(topics):
+        begin_ns = message.time_ns if begin_ns is None else begin_ns
+        stamp_ns = reader.stamp_ns(message)
+        if stamp_ns is not None:
+            ahead[message.topic].append(stamp_ns - message.time_ns)
+        enough = all(len(known) >= _ENOUGH_MESSAGES for known in ahead.values())
+        if enough or message.time_ns - begin_ns > _CLOCK_SEARCH_NS:
+            break
+    # A median: drivers stamp their first message with 0.
+    clocks = {topic: statistics.median_low(known) for topic, known in ahead.items() if known}
+    reference = next(iter(clocks.values()), 0)
+    shifts = {topic: reference - clock for topic, clock in clocks.items()}
+    return {topic: shift for topic, shift in shifts.items() if abs(shift) > _OTHER_CLOCK_NS}
 
 
 def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[str, int]:

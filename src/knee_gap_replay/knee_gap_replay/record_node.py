@@ -21,7 +21,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 
 from knee_gap_node.base_node import GuardedNode
-from knee_gap_node.parameters import refuse_unknown
+from knee_gap_node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay.bag import BagMessage, BagWriter
 from knee_gap_replay.command_line import Parser, positive, run, stop_on_signals
 from knee_gap_replay.errors import BagError
@@ -39,7 +39,8 @@ class RecordNode(GuardedNode):
     """Subscribes to each topic once somebody publishes it, as weakly as its weakest publisher offers."""
 
     def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
-        super().__init__("record")
+        with refused_by_ros():
+            super().__init__("record")
         refuse_unknown(self, self._parameter_overrides)
         self._writer = writer
         self._wanted = [self._resolved(topic) for topic in dict.fromkeys(topics)]
@@ -180,6 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Record topics until SIGINT or SIGTERM; ROS arguments (--ros-args) are understood as by any node."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
+        require_files(given)
         rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's parser raises several unrelated kinds for a bad --ros-args
         print(f"record: {' '.join(str(error).split())}", file=sys.stderr)

@@ -1,6 +1,5 @@
 """`contact_sheet`: the knee at levels 0 to 3 in one picture, beside real frames where there are any."""
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +8,8 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser
+from knee_gap_node.user_files import FileError, open_file
 from knee_gap_simulation.bench import Bench
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.hardness import LEVELS
@@ -17,6 +18,8 @@ from knee_gap_simulation.imaging import ByteImage
 _SIZE_PX = 400
 _LABEL_PX = 34
 # Seconds into each level's recording: the probe is there at some, and away at others.
+_MOST_PICTURE_BYTES = 64 << 20
+_MOST_FRAMES = 128
 _MOMENTS_S = (1.0, 2.2, 3.0, 1.4)
 
 
@@ -42,17 +45,35 @@ def read_frames(path: Path, count: int = 4) -> list[ByteImage]:
     Raises SimulationError where there is none.
     """
     pictures = sorted(p for p in path.iterdir() if p.suffix in (".jpg", ".png")) if path.is_dir() else [path]
-    frames = [image for picture in pictures if (image := cv2.imread(str(picture))) is not None]
+    frames = [image for picture in pictures if (image := _picture(picture)) is not None]
     # A mask or an empty frame is black and white but for the traces of its compression.
     frames = [image for image in frames if ((image > 25) & (image < 230)).mean() > 0.1]
     if not frames and path.is_file():
-        video = cv2.VideoCapture(str(path))
-        while (read := video.read())[0]:
-            frames.append(read[1])
+        frames = _spread_frames(path)
     if not frames:
         raise SimulationError(f"{path} holds no picture and no video")
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
     return [np.asarray(frames[index], dtype=np.uint8) for index in chosen]
+
+
+def _picture(path: Path) -> ByteImage | None:
+    """The picture in a file, None where it is none. Raises FileError for what is no file."""
+    with open_file(path) as file:
+        data = np.frombuffer(file.read(_MOST_PICTURE_BYTES), dtype=np.uint8)
+    return None if data.size == 0 else cv2.imdecode(data, cv2.IMREAD_COLOR)  # type: ignore[return-value]
+
+
+def _spread_frames(path: Path) -> list[ByteImage]:
+    """Frames of a video, evenly spread over its length, as many as fit into memory."""
+    frames: list[ByteImage] = []
+    video, number, every = cv2.VideoCapture(str(path)), 0, 1
+    while (read := video.read())[0]:
+        if number % every == 0:
+            frames.append(np.asarray(read[1], dtype=np.uint8))
+        if len(frames) > _MOST_FRAMES:
+            frames, every = frames[::2], 2 * every
+        number += 1
+    return frames
 
 
 def _moment(level: int, seed: int) -> ByteImage:
@@ -79,7 +100,7 @@ def _label(texts: Sequence[str]) -> ByteImage:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Write a contact sheet; 0 when it is written."""
-    parser = argparse.ArgumentParser(prog="contact_sheet", description=__doc__)
+    parser = Parser(prog="contact_sheet", description=__doc__)
     parser.add_argument("out", type=Path, help="picture to write, .png or .jpg")
     parser.add_argument("--seeds", type=int, nargs="+", default=[4, 2, 11], help="knees to show, one a row")
     parser.add_argument(
@@ -87,12 +108,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     arguments = parser.parse_args(argv)
     try:
+        if arguments.out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            raise SimulationError(f"{arguments.out} must end in .png or .jpg")
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
         real = [frame for path in arguments.beside for frame in read_frames(path)]
         sheet = contact_sheet(arguments.seeds, real)
-    except (SimulationError, OSError) as error:
+    except (SimulationError, FileError, OSError) as error:
         print(f"contact_sheet: {error}", file=sys.stderr)
         return 1
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    except KeyboardInterrupt:
+        print("contact_sheet: stopped before the end", file=sys.stderr)
+        return 130
     if not cv2.imwrite(str(arguments.out), sheet):
         print(f"contact_sheet: {arguments.out} cannot be written as a picture", file=sys.stderr)
         return 1

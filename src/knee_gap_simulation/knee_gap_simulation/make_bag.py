@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser, finite
+from knee_gap_node.user_files import flaw_of_new
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.bench import FROM_SEED, Bench
 from knee_gap_simulation.calibration_bag import (
@@ -249,9 +251,9 @@ def hardness_argument(text: str) -> tuple[str, int]:
     return name, int(level)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> Parser:
     defaults = Recording()
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="make_bag",
         description="Make a bag of a scene whose gap is known, seen by a tracked arthroscope: two rims, "
         "or with --level a knee.",
@@ -259,16 +261,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("out", type=Path, help="folder of the new bag")
     parser.add_argument(
         "--gap-mm",
-        type=float,
+        type=finite,
         help="distance of the rims (4); in a knee the smallest distance (drawn from 3-8)",
     )
     parser.add_argument(
-        "--depth-mm", type=float, help="from the lens to the gap (10; in a knee drawn from 8-15)"
+        "--depth-mm", type=finite, help="from the lens to the gap (10; in a knee drawn from 8-15)"
     )
-    parser.add_argument("--travel-mm", type=float, default=1e3 * defaults.travel, help="travel of the scope")
+    parser.add_argument("--travel-mm", type=finite, default=1e3 * defaults.travel, help="travel of the scope")
     parser.add_argument("--seed", type=int, default=defaults.seed, help="the same seed gives the same bag")
-    parser.add_argument("--duration-s", type=float, help="length of the recording (6; a knee 4)")
-    parser.add_argument("--fps", type=float, help="images a second (60; to calibrate from, 30)")
+    parser.add_argument("--duration-s", type=finite, help="length of the recording (6; a knee 4)")
+    parser.add_argument("--fps", type=finite, help="images a second (60; to calibrate from, 30)")
     parser.add_argument("--quality", type=int, help="of the JPEG images of the rims, 1-100 (60)")
     parser.add_argument("--level", type=int, choices=range(4), help="a knee, this hard to see")
     parser.add_argument(
@@ -285,13 +287,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--no-gap", action="store_true", help="a knee that is closed: no gap is to be found")
     parser.add_argument("--calibration", action="store_true", help="a board and pivoting, to calibrate from")
     parser.add_argument(
-        "--video-delay-ms", type=float, help="how late images are stamped (0; to calibrate from, 12)"
+        "--video-delay-ms", type=finite, help="how late images are stamped (0; to calibrate from, 12)"
     )
     parser.add_argument("--board", choices=BOARDS, help="to calibrate from (charuco)")
     parser.add_argument("--lens", choices=LENSES, help="to calibrate (equidistant)")
     parser.add_argument(
         "--turn-deg",
-        type=float,
+        type=finite,
         help="turn that scope to and fro in its camera head, its notch in the picture (it shows none)",
     )
     parser.add_argument(
@@ -416,8 +418,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if (arguments.board or arguments.lens) and not arguments.calibration:
             raise SimulationError("--board and --lens are for --calibration")
-        if arguments.out.exists():
-            raise BagError(f"{arguments.out} exists already; choose another name or remove it")
+        if flaw := flaw_of_new(arguments.out):
+            raise BagError(flaw)
         if arguments.calibration:
             make_calibration_bag(arguments.out, _calibration(arguments), _told_times)
         elif arguments.level is not None or of_a_knee:
@@ -428,9 +430,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))
-    except (SimulationError, BagError) as error:
+    except (SimulationError, BagError, OSError) as error:
         print(f"make_bag: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("make_bag: stopped before the end", file=sys.stderr)
+        return 130
     size = sum(file.stat().st_size for file in arguments.out.iterdir()) / 1e6
     print(f"{arguments.out}: {size:.1f} MB")
     return 0

@@ -4,10 +4,11 @@ To test and show the tracking without a tracker.
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 
-from knee_gap_replay.command_line import Parser, not_negative, positive, stop_on_signals
+from knee_gap_replay.command_line import Parser, finite, not_negative, positive, stop_on_signals
 from knee_gap_simulation import natnet_server_packets as packets
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.natnet_server import HOST, NatNetServer, ServerSettings
@@ -21,6 +22,12 @@ def _version(text: str) -> packets.Version:
     return int(major), int(minor)
 
 
+def _port(text: str) -> int:
+    if not (text.isdecimal() and len(text) < 6 and 0 < int(text) < 65536):
+        raise argparse.ArgumentTypeError(f"'{text}' is no port, 1 to 65535")
+    return int(text)
+
+
 def _parser() -> Parser:
     parser = Parser(prog="natnet_server", description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
@@ -30,12 +37,12 @@ def _parser() -> Parser:
         "--body", action="append", dest="bodies", help="name of a body, may be repeated (scope, tibia, clock)"
     )
     add("--rate", type=positive, default=240.0, help="frames a second (240)")
-    add("--command-port", type=int, default=1510)
-    add("--data-port", type=int, default=1511, help="port of multicast data")
+    add("--command-port", type=_port, default=1510)
+    add("--data-port", type=_port, default=1511, help="port of multicast data")
     add("--multicast", metavar="GROUP", help="send by multicast to this group, such as 239.255.42.99")
     add("--latency-ms", type=not_negative, default=4.0, help="from exposure to sending (4)")
     add("--jitter-ms", type=not_negative, default=0.0, help="mean of the random further delay (0)")
-    add("--drift-ppm", type=float, default=40.0, help="how much too fast its clock runs (40)")
+    add("--drift-ppm", type=finite, default=40.0, help="how much too fast its clock runs (40)")
     add("--lose", type=not_negative, default=0.0, metavar="SHARE", help="share of frames lost on the way (0)")
     add("--invalid", type=not_negative, default=0.0, metavar="SHARE", help="share of poses not tracked (0)")
     add("--occlude-every", type=not_negative, default=0.0, metavar="S", help="hide the first body that often")
@@ -79,6 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         server = _server(arguments)
     except SimulationError as error:
         parser.error(str(error))
+    except OSError as error:
+        print(f"natnet_server: its ports cannot be used: {error.strerror or error}", file=sys.stderr)
+        return 1
     stop = stop_on_signals()
     settings = server.settings
     group = settings.multicast_address

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_node.user_files import json_value
 from knee_gap_simulation.clocks import seconds
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.instrument_gap import CONE, InstrumentGap
@@ -158,9 +159,9 @@ class SceneTruth:
 def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
     """The truth that a bag's metadata tell. Raises SimulationError where there is none."""
     try:
-        values = json.loads(metadata[METADATA_KEY])
+        values = json_value(metadata[METADATA_KEY])
         kind = values["scene"]["kind"]
-    except (KeyError, TypeError, json.JSONDecodeError):
+    except (LookupError, TypeError, ValueError):
         raise SimulationError(
             f"the bag's metadata have no scene under '{METADATA_KEY}': it is not simulated"
         ) from None
@@ -168,14 +169,18 @@ def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
         raise SimulationError(
             f"the scene '{kind}' of format {values.get('format')} is unknown; known: {RIMS}, {KNEE}, format 1"
         )
-    media = Media(*values.get("media", IN_SALINE))
-    scene: RimScene | KneeScene
-    scene = (RimScene if kind == RIMS else KneeScene).from_dict(values["scene"])
-    return SceneTruth(
-        scene=scene,
-        T_world_scene=np.array(values["T_world_scene"]),
-        lens=RefractedLens.of(Lens(**values["lens"]), media.ratio),
-        scope=Scope.from_dict(values["scope"]),
-        probe=Probe.from_dict(values["probe"]) if "probe" in values else None,
-        media=media,
-    )
+    try:
+        media = Media(*values.get("media", IN_SALINE))
+        scene: RimScene | KneeScene
+        scene = (RimScene if kind == RIMS else KneeScene).from_dict(values["scene"])
+        return SceneTruth(
+            scene=scene,
+            T_world_scene=np.array(values["T_world_scene"], dtype=np.float64).reshape(4, 4),
+            lens=RefractedLens.of(Lens(**values["lens"]), media.ratio),
+            scope=Scope.from_dict(values["scope"]),
+            probe=Probe.from_dict(values["probe"]) if "probe" in values else None,
+            media=media,
+        )
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise SimulationError(f"the scene in the bag's metadata is damaged: {reason}") from None

@@ -1,6 +1,5 @@
 """joint_motion_table: what the test for joint motion detects, and how often it alarms where nothing moves."""
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser
 from knee_gap_uncertainty.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_statistics import Observations, motion_statistics, observations
 from knee_gap_uncertainty.multi_view import MultiViewFit, fit
@@ -55,7 +55,7 @@ class Row(NamedTuple):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="joint_motion_table", description=__doc__)
+    parser = Parser(prog="joint_motion_table", description=__doc__)
     parser.add_argument("--runs", type=int, default=100, help="tracks per line (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise (default 0)")
     parser.add_argument("--images", type=int, default=600, help="images per track (default 600)")

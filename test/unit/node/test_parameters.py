@@ -1,6 +1,8 @@
 """Parameters declared from a dataclass, against a stand-in for the node."""
 
+import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +11,8 @@ import pytest
 pytest.importorskip("rcl_interfaces")
 
 from knee_gap_node.errors import ConfigurationError
-from knee_gap_node.parameters import declare, refuse_unknown
+from knee_gap_node.parameters import declare, refuse_unknown, refused_by_ros, require_files
+from knee_gap_node.user_files import FileError
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,34 @@ def test_bad_values_are_refused_in_one_line(given: dict[str, Any], words: str) -
 def test_misspelt_name_is_refused_with_the_names_there_are() -> None:
     node = StandIn()
     declare(node, Settings)
-    refuse_unknown(node, ["rate", "use_sim_time"])
+    refuse_unknown(node, ["rate", "use_sim_time", "qos_overrides./clock.subscription.depth"])
     with pytest.raises(
         ConfigurationError, match="no parameter ratte; there are: count, limit, medium, offset, rate"
     ):
         refuse_unknown(node, ["ratte"])
+
+
+@pytest.mark.parametrize("name", ["use_sim_timeX", "use_sim_time.x", "start_type_description_services"])
+def test_a_name_that_only_begins_like_a_known_one_is_refused(name: str) -> None:
+    node = StandIn()
+    declare(node, Settings)
+    with pytest.raises(ConfigurationError, match=f"no parameter {name}; there are"):
+        refuse_unknown(node, [name])
+
+
+def test_what_ros_refuses_is_a_mistake_of_the_user_in_one_line() -> None:
+    class InvalidTypeError(Exception):
+        """As rclpy's own."""
+
+    with pytest.raises(ConfigurationError, match="'use_sim_time' to 'abc'") as refusal, refused_by_ros():
+        raise InvalidTypeError("Trying to set parameter 'use_sim_time' to 'abc'\nof type 'STRING'")
+    assert "\n" not in str(refusal.value)
+
+
+def test_parameter_files_are_looked_at_before_ros_waits_for_them(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo.yaml")
+    (tmp_path / "good.yaml").write_text("/**:\n  ros__parameters:\n    a: 1\n")
+    require_files(["node", "--ros-args", "--params-file", str(tmp_path / "good.yaml"), "-p", "a:=1"])
+    for name, words in (("fifo.yaml", "is a FIFO"), ("none.yaml", "No such file"), (".", "is a folder")):
+        with pytest.raises(FileError, match=words):
+            require_files(["node", "--ros-args", "--params-file", str(tmp_path / name)])

@@ -1,18 +1,21 @@
 """`calibrate` on a small simulated bag: the whole way from pictures to a file, and a user's mistakes."""
 
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.bag_input import CalibrationBag
+from knee_gap_perception.calibration.bag_input import STEP_TOPIC, CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.calibration.command import main
+from knee_gap_perception.calibration.command import chosen_steps, main
+from knee_gap_perception.calibration.recording import Recording, Request
 from knee_gap_perception.calibration.rigid import inverse, to_vector
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.medium import SALINE
-from knee_gap_replay.bag import BagReader
+from knee_gap_replay.bag import BagMessage, BagReader, BagWriter
 from knee_gap_simulation.calibration_bag import CalibrationRecording, calibration_truth, make_calibration_bag
 from knee_gap_simulation.rigid import transform
 
@@ -90,6 +93,8 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["pivot", "BAG", "--into", "OUT"], "calibrate intrinsics first"),
         (["intrinsics", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "500"], "from 500 s"),
         (["hand_eye", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "5", "--end", "2"], "lie before"),
+        (["pivot", "BAG", "--into", "OUT", "--begin", "1e300"], "lie before"),
+        (["pivot", "BAG", "--into", "OUT", "--time-offset", "1e300"], "--time-offset must lie within 10 s"),
         (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "a folder that may be written"),
         (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
@@ -109,6 +114,133 @@ def test_mistakes_are_one_line(
     assert len(errors) == 1
     assert reason in errors[0]
     assert not (tmp_path / "scope.yaml").exists()
+
+
+def copied(bag: Path, out: Path, keep: Callable[[BagMessage], bool]) -> Path:
+    """A bag of some of the messages of another, byte for byte."""
+    with BagReader(bag) as reader, BagWriter(out) as writer:
+        for name, topic in reader.details.items():
+            writer.add_topic(name, topic.msgtype, topic.qos)
+        for message in reader.messages():
+            if keep(message):
+                writer.write_raw(message.topic, message.data, message.time_ns)
+    return out
+
+
+def start_of(bag: Path, step: str) -> int:
+    """When a step of a marked bag begins [ns]."""
+    with BagReader(bag) as reader:
+        first = next(reader.messages()).time_ns
+    return first + round(CalibrationBag(bag).steps()[step][0] * 1e9)
+
+
+@pytest.fixture(scope="module")
+def step_bags(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The board and the pivoting of a bag, each in a bag without marks."""
+    folder = tmp_path_factory.mktemp("steps")
+    end_ns = start_of(bag, "pivot")
+    board = copied(bag, folder / "board", lambda m: m.topic != STEP_TOPIC and m.time_ns < end_ns)
+    pivot = copied(bag, folder / "pivot", lambda m: m.topic != STEP_TOPIC and m.time_ns >= end_ns)
+    return board, pivot
+
+
+def test_a_bag_a_step_gives_what_one_marked_bag_gives(
+    bag: Path, step_bags: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board, pivot = step_bags
+    options = ["--board", BOARD, "--views", 12]
+    one, two, three = tmp_path / "one.yaml", tmp_path / "two.yaml", tmp_path / "three.yaml"
+    named = [f"board={board}", f"pivot={pivot}"]
+    for step, of in (("intrinsics", board), ("hand_eye", board), ("pivot", pivot)):
+        for out, bags in ((one, [bag]), (two, named), (three, [of])):
+            code, _, errors = run(capsys, step, *bags, "--into", out, *options)
+            assert (code, errors) == (0, [])
+    marked, together, single = (load_calibration(path) for path in (one, two, three))
+    for found in (together, single):
+        assert found.camera is not None
+        assert marked.camera is not None
+        assert found.tip is not None
+        assert marked.tip is not None
+        assert found.camera.parameters == pytest.approx(marked.camera.parameters, abs=1e-6)
+        assert found.tip.position == pytest.approx(marked.tip.position, abs=5e-6)
+        # The body's path is smoothed up to the end of its bag.
+        error = to_vector(inverse(found.body_to_lens()) @ marked.body_to_lens())
+        assert np.linalg.norm(error[3:]) < 2e-5
+        assert np.linalg.norm(error[:3]) < 2e-5
+
+
+def test_all_steps_are_those_that_bags_are_named_for(step_bags: tuple[Path, Path]) -> None:
+    board, pivot = step_bags
+    steps = ["time_offset", "intrinsics", "hand_eye"]
+    for bags, known in (({"board": board, "pivot": pivot}, [*steps, "pivot"]), ({"": board}, steps)):
+        assert chosen_steps("all", Recording(Request(bags), lambda items, _: items)) == known
+
+
+@pytest.mark.parametrize(
+    ("bags", "reason"),
+    [
+        (["BOARD", "PIVOT"], "of several bags each is one step: name them board=BAG"),
+        (["board=BOARD", "PIVOT"], "which step is it?"),
+        (["board=BOARD", "board=PIVOT"], "two bags are named for the step board"),
+        (["pivot=PIVOT"], "no bag was named for the step 'board'; there are pivot"),
+        (["board=BOARD", "pivot=BAG"], "overlap in time"),
+        (["board=BOARD", "pivot=PIVOT", "--end", "3"], "several are given"),
+        (["board=NOWHERE"], "does not exist"),
+        (["bored=BOARD"], "does not exist"),
+    ],
+)
+def test_mistakes_with_several_bags_are_one_line(
+    bag: Path,
+    step_bags: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    bags: list[str],
+    reason: str,
+) -> None:
+    places = {"BOARD": step_bags[0], "PIVOT": step_bags[1], "BAG": bag, "NOWHERE": tmp_path / "nowhere"}
+    given = []
+    for text in bags:
+        name, equals, place = text.rpartition("=")
+        given.append(f"{name}{equals}{places.get(place, place)}")
+    code, _, errors = run(capsys, "hand_eye", *given, "--into", tmp_path / "scope.yaml", "--board", BOARD)
+    assert code == 1
+    assert len(errors) == 1, errors
+    assert reason in errors[0]
+
+
+def test_a_bag_without_metadata_is_read_as_by_check_and_process(
+    step_bags: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "bare"
+    folder.mkdir()
+    shutil.copy(step_bags[0] / "board.mcap", folder / "board.mcap")
+    hashes = []
+    for number, place in enumerate((step_bags[0], folder, folder / "board.mcap")):
+        out = tmp_path / f"{number}.yaml"
+        code, _, errors = run(capsys, "intrinsics", place, "--into", out, "--board", BOARD, "--views", 8)
+        assert (code, errors) == (0, [])
+        hashes.append(load_calibration(out).hash)
+    assert len(set(hashes)) == 1
+
+
+def test_a_cut_bag_is_calibrated_by_what_is_left_or_refused_in_one_line(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    content = (bag / "bag.mcap").read_bytes()
+    ends = []
+    for share in (0.0005, 0.02, 0.3, 0.7):
+        cut = tmp_path / f"cut_{share}.mcap"
+        cut.write_bytes(content[: round(share * len(content))])
+        caplog.clear()
+        code, _, errors = run(
+            capsys, "hand_eye", cut, "--into", tmp_path / f"{share}.yaml", "--board", BOARD, "--views", 8
+        )
+        assert code == (1 if errors else 0)
+        assert len(errors) <= 1, errors
+        assert len([record for record in caplog.records if "bytes lost" in record.message]) <= 1
+        ends.append(code)
+    assert ends[0] == 1
+    assert ends[-1] == 0
 
 
 @pytest.fixture(scope="module")

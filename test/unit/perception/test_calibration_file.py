@@ -1,11 +1,14 @@
 """The calibration's file: round trip, hash, refusals; what the lens's error does to two views."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from knee_gap_perception.calibration import calibration_file
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     Clock,
@@ -13,8 +16,10 @@ from knee_gap_perception.calibration.calibration_file import (
     Oblique,
     Tip,
     load_calibration,
+    require_place,
     save_calibration,
 )
+from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.calibration.intrinsics import Intrinsics
 from knee_gap_perception.calibration.lens_error import lens_covariance, lens_errors
 from knee_gap_perception.calibration.rigid import from_vector, to_vector
@@ -36,12 +41,13 @@ LENS = LensOnBody(
     np.array([0.0035, -0.012, 0.2031]), np.array([0.24, -0.02, -0.03, np.sqrt(1 - 0.0589)]),
     covariance(6, 1e-5), Mount.CAMERA_HEAD, 7e-5, 3.7e-5, 0.4, 48,
 )  # fmt: skip
+OBLIQUE = Oblique(-0.56, ShaftAxis(np.array([0.0, 0.6, 0.8]), np.array([0.003, -0.012, 0.1])), 5e-5, 4e-6)
 WHOLE = Calibration(
     1280,
     720,
     CAMERA,
     LENS,
-    Oblique(-0.56, ShaftAxis(np.array([0.0, 0.6, 0.8]), np.array([0.003, -0.012, 0.1])), 5e-5, 4e-6),
+    OBLIQUE,
     Tip(np.array([0.0035, -0.012, 0.2043]), covariance(3, 1e-6), 4e-5),
     Clock(-0.01198, 6e-5, "board"),
 )
@@ -89,7 +95,7 @@ def test_a_file_changed_by_hand_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("a: [", "not YAML"),
+        ("a: [", "is not a YAML file"),
         ("a: 1", "no calibration"),
         ("format: knee_gap_calibration 1\nimage: 3", "malformed"),
         ("format: knee_gap_calibration 1\nhash: abc", "'image' is missing"),
@@ -102,6 +108,128 @@ def test_other_files_are_refused(tmp_path: Path, text: str, reason: str) -> None
         load_calibration(path)
     with pytest.raises(PerceptionError, match="cannot be read"):
         load_calibration(tmp_path / "missing.yaml")
+
+
+NAN, BIG = float("nan"), float("inf")
+
+
+def with_right_hash(calibration: Calibration, path: Path) -> Path:
+    """A file as `calibrate` would write it, of numbers that it never would."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(calibration_file, "broken_rule", lambda _: "")
+        save_calibration(calibration, path)
+    return path
+
+
+def lens(**changes: Any) -> Calibration:
+    return replace(WHOLE, lens=replace(LENS, **changes))
+
+
+def camera(**changes: Any) -> Calibration:
+    return replace(WHOLE, camera=replace(CAMERA, **changes))
+
+
+def changed(covariance: np.ndarray, *places: tuple[int, int], value: float) -> np.ndarray:  # type: ignore[type-arg]
+    result = covariance.copy()
+    for place in places:
+        result[place] = value
+    return result
+
+
+@pytest.mark.parametrize(
+    ("calibration", "reason"),
+    [
+        (lens(covariance=LENS.covariance * NAN), "lens: the covariance has entries that are not finite"),
+        (lens(covariance=-LENS.covariance), "lens: the covariance has a variance that is not above 0"),
+        (lens(covariance=np.zeros((6, 6))), "lens: the covariance has a variance that is not above 0"),
+        (lens(covariance=LENS.covariance * BIG), "not finite"),
+        (lens(covariance=changed(LENS.covariance, (1, 2), value=1.0)), "is not symmetric"),
+        (
+            lens(covariance=changed(LENS.covariance, (1, 2), (2, 1), value=1e-3)),
+            "is not positive semidefinite",
+        ),
+        (lens(quaternion_xyzw=np.zeros(4)), "the quaternion must have length 1, not 0"),
+        (lens(quaternion_xyzw=LENS.quaternion_xyzw * 2), "the quaternion must have length 1, not 2"),
+        (lens(quaternion_xyzw=LENS.quaternion_xyzw * NAN), "the quaternion must have length 1, not nan"),
+        (lens(translation=LENS.translation * NAN), "the translation must be finite"),
+        (lens(rotation_error=NAN), "errors must be finite"),
+        (lens(translation_error=-1e-5), "errors must be finite and not negative"),
+        (replace(WHOLE, clock=Clock(NAN, 6e-5, "board")), "clock: the offset must lie within 10 s, not nan"),
+        (replace(WHOLE, clock=Clock(0.0, NAN, "board")), "clock: the standard error must be finite"),
+        (replace(WHOLE, clock=Clock(0.0, 0.0, "board")), "above 0 s, not 0 s"),
+        (replace(WHOLE, clock=Clock(0.0, -1e-5, "board")), "above 0 s, not -1e-05 s"),
+        (replace(WHOLE, clock=Clock(1e9, 1e-5, "board")), "clock: the offset must lie within"),
+        (camera(covariance=np.zeros((8, 8))), "camera: the covariance has a variance that is not above 0"),
+        (camera(covariance=CAMERA.covariance * NAN), "camera: the covariance has entries"),
+        (camera(k=(NAN, *CAMERA.k[1:])), "camera: k must be 9 finite numbers"),
+        (camera(k=(-452.1, *CAMERA.k[1:])), "camera: focal lengths must be above 0 px"),
+        (camera(d=(NAN, 0.0, 0.0, 0.0)), "camera: k must be 9 finite numbers, and d finite"),
+        (camera(distortion_model="thin_air"), "camera: the distortion model must be one of"),
+        (camera(rms_px=NAN), "camera: rms_px"),
+        (replace(WHOLE, tip=Tip(np.zeros(3), np.zeros((3, 3)), 1e-5)), "tip: the covariance has a variance"),
+        (replace(WHOLE, tip=Tip(np.full(3, NAN), np.eye(3), 1e-5)), "tip: position and rms must be finite"),
+        (
+            replace(WHOLE, oblique=replace(OBLIQUE, axis_tilt_sigma=0.0)),
+            "oblique: the errors of the axis",
+        ),
+        (replace(WHOLE, oblique=replace(OBLIQUE, notch_angle=BIG)), "oblique: the notch's angle"),
+        (
+            replace(WHOLE, oblique=replace(OBLIQUE, T_head_scope=np.zeros((4, 4)))),
+            "T_head_scope is not a rotation",
+        ),
+        (replace(WHOLE, width_px=0), "the image's size must lie in"),
+    ],
+)
+def test_a_right_hash_over_wrong_numbers_is_refused(
+    tmp_path: Path, calibration: Calibration, reason: str
+) -> None:
+    path = with_right_hash(calibration, tmp_path / "scope.yaml")
+    with pytest.raises(PerceptionError, match=reason) as refusal:
+        load_calibration(path)
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(PerceptionError, match=reason):
+        save_calibration(calibration, tmp_path / "other.yaml")
+    assert not (tmp_path / "other.yaml").exists()
+
+
+def test_terms_of_the_lens_that_were_not_fitted_have_no_variance(tmp_path: Path) -> None:
+    fixed = CAMERA.covariance.copy()
+    fixed[6:], fixed[:, 6:] = 0.0, 0.0
+    save_calibration(camera(covariance=fixed), tmp_path / "scope.yaml")
+    back = load_calibration(tmp_path / "scope.yaml").camera
+    assert back is not None
+    assert np.diagonal(back.covariance)[6:] == pytest.approx([0.0, 0.0])
+    fixed[6, 0] = 1e-3
+    with pytest.raises(PerceptionError, match="relates an unknown that has no variance"):
+        save_calibration(camera(covariance=fixed), tmp_path / "scope.yaml")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "- " * 100_000, "a: &x [*x]", "\x00"])
+def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "scope.yaml"
+    path.write_text(text)
+    with pytest.raises(PerceptionError, match=r"scope\.yaml is not a YAML file") as refusal:
+        load_calibration(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(PerceptionError, match="is a FIFO, not a file"):
+        load_calibration(tmp_path / "fifo")
+    with pytest.raises(PerceptionError, match="is a device, not a file"):
+        load_calibration(Path("/dev/zero"))
+    with pytest.raises(PerceptionError, match="there is no such user"):
+        CalibrationParameters(calibration_file="~nosuchuser_at_all/scope.yaml").load()
+
+
+def test_no_place_for_a_calibration_is_told_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "fifo")
+    for place in (tmp_path / "link", tmp_path / "fifo", tmp_path, tmp_path / "nowhere" / "scope.yaml"):
+        with pytest.raises(PerceptionError, match="must name a file in a folder that may be written"):
+            require_place(place)
+    require_place(tmp_path / "new.yaml")
 
 
 def test_images_of_another_size_are_refused() -> None:

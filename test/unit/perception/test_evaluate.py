@@ -167,4 +167,4 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert len(lines) == 1
         assert reason in lines[0]
     assert main([str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
-    assert "metadata.yaml" in capsys.readouterr().err
+    assert "it holds no MCAP file" in capsys.readouterr().err

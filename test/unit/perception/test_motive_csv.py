@@ -1,3 +1,4 @@
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -293,6 +294,35 @@ class TestRefusals:
             # At the end of a line only the header's count tells a shorter take from a whole one.
             assert text[:length].endswith("\n")
             assert len(cut.time) < cut.exported_count == len(whole.time)
+
+    def test_a_file_cut_in_a_quoted_cell_is_cut(self, tmp_path):
+        text = Export().text([[SEEN, SEEN]] * 5)
+        lines = text.splitlines(keepends=True)
+        # A line break inside the quotes is no end of a line, whatever the last byte is.
+        for end in ('"0.1\r\n', '"0.1', '4,0.04,"0.1\r\n', '4,0.04,"\r\n\r\n'):
+            cut = "".join(lines[:-1]) + end
+            with pytest.raises(TakeError, match="the file ends in the middle of it, after 4 whole frames"):
+                read_take(written(tmp_path, cut))
+            assert len(read_take(written(tmp_path, cut), partial=True).time) == 4
+        with pytest.raises(TakeError, match=r"first line must start with|no row that starts with"):
+            read_take(written(tmp_path, '"Format Version,1.23\r\n' + text))
+        with pytest.raises(TakeError, match="field larger than field limit"):
+            read_take(written(tmp_path, text + '"' + "0,\r\n" * 60_000))
+        quoted = text.replace("a take", '"a, take"')
+        assert len(read_take(written(tmp_path, quoted)).time) == 5
+
+    def test_what_is_no_file_is_refused_and_not_waited_for(self, tmp_path):
+        os.mkfifo(tmp_path / "take.csv")
+        with pytest.raises(TakeError, match="is a FIFO, not a file"):
+            read_take(tmp_path / "take.csv")
+        with pytest.raises(TakeError, match="is a device, not a file"):
+            read_take(Path("/dev/zero"))
+
+    @pytest.mark.parametrize(("old", "new"), [("0,0.000000", "1e300,0"), ("0,0.000000", "0,1e300")])
+    def test_numbers_beyond_any_take_are_refused(self, tmp_path, old, new):
+        text = Export().text([[SEEN, SEEN]] * 2)
+        with pytest.raises(TakeError, match="no frame number and time"):
+            read_take(written(tmp_path, text.replace(old, new, 1)))
 
     def test_what_is_whole_of_a_cut_file_on_request(self, tmp_path):
         text = Export().text(ROWS)[:-20]

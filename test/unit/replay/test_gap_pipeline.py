@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from knee_gap_perception.edge_stream import EdgeStream
 from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_replay.bag import BagReader, BagWriter
 from knee_gap_replay.pipeline import GapPipeline
-from knee_gap_replay.processing import Output
+from knee_gap_replay.processing import Output, process
 from knee_gap_replay.topics import InputTopics
 from knee_gap_replay.types import blank
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -28,7 +30,7 @@ POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
 GAP = float(np.linalg.norm(POINTS[0] - POINTS[1]))
 POSE_PERIOD_NS = 8_333_333
 TRACKING = TrackingParameters(body_to_shaft_translation=(0.0, 0.01, 0.2), oblique_angle=0.5)
-VALID, TRACKING_LOST, INSUFFICIENT_PARALLAX, JOINT_MOVED = 1, 3, 4, 6
+VALID, TRACKING_LOST, INSUFFICIENT_PARALLAX, OUT_OF_SYNC, JOINT_MOVED = 1, 3, 4, 5, 6
 
 
 def lens_pose(stamp_ns: int) -> Array:
@@ -140,6 +142,40 @@ def test_the_known_distance_comes_out_once_the_scope_has_moved() -> None:
     assert all(gap.gap_min < GAP < gap.gap_max for gap in valid)
     assert valid[-1].gap == pytest.approx(GAP, rel=0.02)
     assert gaps[1].status == INSUFFICIENT_PARALLAX
+
+
+@pytest.mark.parametrize("image_clock_s", [0.0, -1_790_000_000.0 + 5_000.0])
+def test_images_stamped_since_boot_are_out_of_sync_as_live(tmp_path: Path, image_clock_s: float) -> None:
+    """Poses are stamped since 1970, images and camera model by a clock that began at boot."""
+    epoch_ns, shift_ns = 1_790_000_000 * 10**9, round(image_clock_s * 1e9)
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic, msgtype in (
+            ("/camera_info", "sensor_msgs/msg/CameraInfo"),
+            ("/body", "geometry_msgs/msg/PoseStamped"),
+            ("/image", "sensor_msgs/msg/CompressedImage"),
+        ):
+            bag.add_topic(topic, msgtype, "sensor")
+        for index in range(240):
+            stamp_ns = epoch_ns + index * POSE_PERIOD_NS
+            bag.write("/body", body(stamp_ns), stamp_ns + 3_000_000)
+            if index % 2 == 0:
+                image_ns = stamp_ns + 1_000_000
+                for topic, msgtype in (("/camera_info", "CameraInfo"), ("/image", "CompressedImage")):
+                    message = stamped(f"sensor_msgs/msg/{msgtype}", image_ns + shift_ns)
+                    bag.write(topic, message, image_ns + 10_000_000)
+    pipeline = GapPipeline(
+        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
+    )
+    with BagReader(tmp_path / "bag") as reader, BagWriter(tmp_path / "out") as writer:
+        process(reader, writer, pipeline)
+    with BagReader(tmp_path / "out") as reader:
+        statuses = [reader.deserialize(message).status for message in reader.messages(["/space/gap"])]
+    assert len(statuses) == 120
+    if image_clock_s:
+        # The first may come before any pose, as when a node has just been started.
+        assert set(statuses[4:]) == {OUT_OF_SYNC}
+    else:
+        assert OUT_OF_SYNC not in statuses[4:]
 
 
 def test_plain_numbers_repeat_the_valid_estimates_and_no_others() -> None:

@@ -55,6 +55,23 @@ def test_the_order_is_that_of_the_stamps_whatever_the_latencies(tmp_path: Path) 
     assert [stamp for _, stamp in got] == sorted(stamp for _, stamp in got)
 
 
+def test_a_topic_of_another_clock_is_put_where_it_was_recorded(tmp_path: Path) -> None:
+    """Stamps since boot beside stamps since 1970, and a first message that is stamped with 0."""
+    epoch_ms, boot_ms = 1_790_000_000_000, 5_000_000
+    records = [("/a", epoch_ms + t, epoch_ms + t + 4) for t in range(0, 4000, 8)]
+    records += [("/b", boot_ms + t if t else 0, epoch_ms + t + 4) for t in range(0, 4000, 16)]
+    bag = write(tmp_path / "bag", sorted(records, key=lambda r: r[2]))
+    for topics in (["/a", "/b"], ["/b", "/a"]):
+        got = order(bag, topics)
+        assert sorted(topic for topic, _ in got) == ["/a"] * 500 + ["/b"] * 250
+        # Apart from the first, one of /b for every two of /a, at no time more behind than the other.
+        names = [topic for topic, _ in got if _ > 0]
+        ahead = np.cumsum([1 if name == "/a" else -2 for name in names])
+        assert np.abs(ahead).max() <= 4
+        stamps = [stamp for _, stamp in got][1:]
+        assert stamps == sorted(stamps)
+
+
 def test_of_equal_stamps_the_first_topic_asked_for_comes_first(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", [("/b", 100, 110), ("/a", 100, 130), ("/b", 200, 210), ("/a", 200, 205)])
     assert order(bag, ["/a", "/b"]) == [("/a", 100), ("/b", 100), ("/a", 200), ("/b", 200)]

@@ -7,7 +7,7 @@ from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, Edge
 from knee_gap_uncertainty.gap_profile import gap_profile
 from knee_gap_uncertainty.instrument_gap import Edges, opening_of
 from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.posed_view import posed_view
+from knee_gap_uncertainty.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.section_edges import NOT_FINITE, NOT_YET, UNSEEN, SectionInView
 
 POINTS = np.array([[0.0, -0.003, 0.012], [0.0, 0.003, 0.012]])
@@ -19,7 +19,7 @@ def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def at(seconds, place=(0.0, 0.0, 0.0), states=SEEN, **changes):
+def at(seconds, place=(0.0, 0.0, 0.0), states=SEEN, **changes) -> tuple[EdgeObservation, PosedView]:
     """Observation and view of the points and edges from a lens at a place."""
     stamp_ns = int(1e9 * seconds)
     towards = unit(POINTS - place)

@@ -1,24 +1,25 @@
-"""What calibration reads of a recorded bag, through `rosbags` alone: no ROS and no workspace needed."""
+"""What calibration reads of recorded bags, by the one reader of all commands; no ROS needed."""
 
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+import logging
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import ReaderError
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from knee_gap_node.bag_paths import missing_bag
+from knee_gap_node.bag.bag import BagMessage, BagReader
+from knee_gap_node.bag.errors import BagError
 from knee_gap_perception.calibration.rigid import Array, rigid
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import image_from_compressed, image_from_message, stamp_ns
 
+_LOG = logging.getLogger(__name__)
 STEP_TOPIC = "/knee_gap/calibration_step"
+LONGEST_BAG = 1e9  # [s]
 IMAGE_TYPES = {
     "sensor_msgs/msg/CompressedImage": image_from_compressed,
     "sensor_msgs/msg/Image": image_from_message,
@@ -28,22 +29,42 @@ POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovari
 
 @dataclass(frozen=True)
 class CalibrationBag:
-    """A recorded bag, and the part of it [s from its start] that is to be read."""
+    """A recorded bag, and the part of it [s from its start] that is to be read.
+
+    Raises PerceptionError where there is no bag, or not one that can be read.
+    """
 
     path: Path
     begin: float = 0.0
     end: float = float("inf")
+    # Opened once for all parts, so that damage is told once.
+    _reader: BagReader | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self._reader is None:
+            object.__setattr__(self, "_reader", opened(self.path))
+
+    @property
+    def reader(self) -> BagReader:
+        """The bag itself."""
+        assert self._reader is not None
+        return self._reader
 
     def steps(self) -> dict[str, tuple[float, float]]:
         """Parts [s] that the step topic marks, by name; empty where nothing was marked."""
-        marks: list[tuple[float, str]] = []
-        with opened(self.path) as reader:
-            connections = [c for c in reader.connections if c.topic == STEP_TOPIC]
-            for connection, time_ns, data in reader.messages(connections) if connections else ():
-                name = str(getattr(reader.deserialize(data, connection.msgtype), "data", ""))
-                marks.append(((time_ns - reader.start_time) * 1e-9, name))
-            ends = [begin for begin, _ in marks[1:]] + [reader.duration * 1e-9]
-        return {name: (begin, end) for (begin, name), end in zip(marks, ends, strict=True) if name != "end"}
+        if STEP_TOPIC not in self.reader.topics:
+            return {}
+        start_ns, marks = self._start_ns(), []
+        for entry in self.reader.messages([STEP_TOPIC]):
+            message = self._readable(entry)
+            if message is not None:
+                marks.append(((entry.time_ns - start_ns) * 1e-9, str(getattr(message, "data", ""))))
+        ends = [begin for begin, _ in marks[1:]] + [float("inf")]
+        return {
+            name: (begin, end)
+            for (begin, name), end in zip(marks, ends[: len(marks)], strict=True)
+            if name != "end"
+        }
 
     def part(self, name: str) -> "CalibrationBag":
         """The part that a step marks, or the whole bag where no step is marked at all.
@@ -56,7 +77,7 @@ class CalibrationBag:
         if name not in steps:
             raise PerceptionError(f"{self.path} has no step '{name}'; it has {', '.join(steps)}")
         begin, end = steps[name]
-        return CalibrationBag(self.path, max(begin, self.begin), min(end, self.end))
+        return CalibrationBag(self.path, max(begin, self.begin), min(end, self.end), self.reader)
 
     def images(self, topic: str) -> Generator[tuple[int, npt.NDArray[np.uint8]], None, None]:
         """Stamp [ns] and image (h, w, 3) of every image.
@@ -68,18 +89,22 @@ class CalibrationBag:
 
     def has(self, topic: str) -> bool:
         """Whether the bag has messages on a topic."""
-        with opened(self.path) as reader:
-            return any(c.topic == topic and c.msgcount for c in reader.connections)
+        if topic not in self.reader.topics:
+            return False
+        count = self.reader.count([topic])
+        return next(self.reader.messages([topic]), None) is not None if count is None else count > 0
 
     def camera_info(self, topic: str) -> Any | None:
         """The first sensor_msgs/CameraInfo on a topic; None where there is none."""
         if not self.has(topic):
             return None
-        return next(iter(self._messages(topic, ("sensor_msgs/msg/CameraInfo",))))[1]
+        first = next(iter(self._messages(topic, ("sensor_msgs/msg/CameraInfo",))), None)
+        return None if first is None else first[1]
 
     def image_stamps(self, topic: str) -> npt.NDArray[np.int64]:
         """Stamps [ns] of every image, none decoded."""
-        return np.array([stamp for stamp, _, _ in self._messages(topic, tuple(IMAGE_TYPES))], dtype=np.int64)
+        stamps = [self.reader.stamp_ns(entry) for entry in self._entries(topic, tuple(IMAGE_TYPES))]
+        return np.array([stamp for stamp in stamps if stamp is not None], dtype=np.int64)
 
     def poses(self, topic: str) -> tuple[npt.NDArray[np.int64], Array]:
         """Stamps (n,) [ns] and poses (n, 4, 4); what is no pose (NaN, no unit quaternion) is left out."""
@@ -96,37 +121,104 @@ class CalibrationBag:
             raise PerceptionError(f"no usable pose on {topic} in {self.path}: did the tracker see the body?")
         return np.array(stamps, dtype=np.int64), rigid(Rotation.from_quat(quaternions).as_matrix(), positions)
 
+    def span_ns(self, topic: str) -> tuple[int, int] | None:
+        """First and last stamp [ns] on a topic; None where it has none."""
+        entries = self._entries(topic, POSE_TYPES) if self.has(topic) else ()
+        stamps = [stamp for entry in entries if (stamp := self.reader.stamp_ns(entry)) is not None]
+        return (min(stamps), max(stamps)) if stamps else None
+
     def _messages(self, topic: str, msgtypes: tuple[str, ...]) -> Iterator[tuple[int, Any, str]]:
-        with opened(self.path) as reader:
-            connections = _connections(reader, topic, msgtypes, self.path)
-            start, stop = reader.start_time + int(self.begin * 1e9), None
-            if np.isfinite(self.end):
-                stop = reader.start_time + int(self.end * 1e9)
-            for connection, _, data in reader.messages(connections, start=start, stop=stop):
-                message: Any = reader.deserialize(data, connection.msgtype)
-                yield stamp_ns(message.header), message, connection.msgtype
+        for entry in self._entries(topic, msgtypes):
+            message = self._readable(entry)
+            if message is not None:
+                yield stamp_ns(message.header), message, entry.msgtype
+
+    def _entries(self, topic: str, msgtypes: tuple[str, ...]) -> Iterator[BagMessage]:
+        """The part's messages on a topic. Raises PerceptionError where it is not of one of the types."""
+        _require_type(self.reader, topic, msgtypes)
+        start_ns = self._start_ns()
+        first_ns = start_ns + round(self.begin * 1e9)
+        last_ns = start_ns + round(self.end * 1e9) if self.end < LONGEST_BAG else None
+        for entry in self.reader.messages([topic]):
+            if last_ns is not None and entry.time_ns >= last_ns:
+                return
+            if entry.time_ns >= first_ns:
+                yield entry
+
+    def _start_ns(self) -> int:
+        """When the first message of the bag was recorded [ns]."""
+        first = next(self.reader.messages(), None)
+        return 0 if first is None else first.time_ns
+
+    def _readable(self, entry: BagMessage) -> Any | None:
+        """A message; None, and one line in the log, where its bytes are none."""
+        try:
+            return self.reader.deserialize(entry)
+        except BagError as error:
+            _LOG.warning(str(error))
+            return None
 
 
-def opened(path: Path) -> AnyReader:
-    """Reader of a bag, named by its folder or a file in it. Raises PerceptionError where it is none."""
-    folder = path.parent if path.suffix == ".mcap" else path
-    # Other storages than MCAP are read as well, where there is one.
-    if not any(folder.glob("*.db3")) and (flaw := missing_bag(path)):
-        raise PerceptionError(flaw)
-    if not (folder / "metadata.yaml").is_file():
-        raise PerceptionError(f"{path} is no ROS 2 bag: there is no metadata.yaml")
+class CalibrationBags:
+    """The bags of one calibration: one for all steps, or one a step.
+
+    `bags` are the bags of named steps; the one without a name ("") has the steps that its marks say. A bag
+    without marks is any step that is asked of it. Raises PerceptionError for a bag that cannot be read.
+    """
+
+    def __init__(self, bags: Mapping[str, Path], begin: float = 0.0, end: float = float("inf")) -> None:
+        self._bags = {step: CalibrationBag(path, begin, end) for step, path in bags.items()}
+
+    def steps(self) -> list[str]:
+        """Steps that there are parts for, as the bags are named or marked."""
+        marked = list(self._bags[""].steps()) if "" in self._bags else []
+        return [*(step for step in self._bags if step), *marked]
+
+    def part(self, step: str) -> CalibrationBag:
+        """The part of a step. Raises PerceptionError where there is none."""
+        if step in self._bags:
+            return self._bags[step].part(step)
+        if "" in self._bags:
+            return self._bags[""].part(step)
+        raise PerceptionError(f"no bag was named for the step '{step}'; there are {', '.join(self._bags)}")
+
+    def poses(self, topic: str) -> tuple[npt.NDArray[np.int64], Array]:
+        """Stamps (n,) [ns] and poses (n, 4, 4) of all bags, one after the other."""
+        read = [bag.poses(topic) for bag in self._each() if len(self._bags) == 1 or bag.has(topic)]
+        if not read:
+            raise PerceptionError(f"no bag has poses on {topic}")
+        return np.concatenate([stamps for stamps, _ in read]), np.concatenate([poses for _, poses in read])
+
+    def require_apart(self, topic: str) -> None:
+        """Raise PerceptionError where poses of bags overlap in time: one's would be taken for the other's."""
+        bags = self._each() if len(self._bags) > 1 else []
+        spans = sorted((*span, str(bag.path)) for bag in bags if (span := bag.span_ns(topic)))
+        for (_, last, one), (first, _, other) in pairwise(spans):
+            if first <= last:
+                raise PerceptionError(
+                    f"{one} and {other} overlap in time: the steps are recorded one after the other"
+                )
+
+    def _each(self) -> list[CalibrationBag]:
+        """The bags, each once."""
+        return list({bag.path: bag for bag in self._bags.values()}.values())
+
+
+def opened(path: Path) -> BagReader:
+    """Reader of a bag, a folder or an MCAP file. Raises PerceptionError where it is none."""
     try:
-        return AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-    except (AnyReaderError, ReaderError) as error:
-        raise PerceptionError(f"{path} cannot be read: {error}") from None
+        return BagReader(path)
+    except BagError as error:
+        raise PerceptionError(str(error)) from None
+    except OSError as error:
+        raise PerceptionError(f"{path} cannot be read: {error.strerror}") from None
 
 
-def _connections(reader: AnyReader, topic: str, msgtypes: tuple[str, ...], path: Path) -> list[Connection]:
-    connections = [c for c in reader.connections if c.topic == topic]
-    fitting = [c for c in connections if c.msgtype in msgtypes]
-    if fitting:
-        return fitting
-    if connections:
-        raise PerceptionError(f"{topic} carries {connections[0].msgtype}, not {' or '.join(msgtypes)}")
-    others = ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in msgtypes})) or "none"
-    raise PerceptionError(f"{topic} is not in {path}; topics of that kind: {others}")
+def _require_type(reader: BagReader, topic: str, msgtypes: tuple[str, ...]) -> None:
+    """Raise PerceptionError for a topic that is not in the bag or has none of the types."""
+    if (msgtype := reader.topics.get(topic)) in msgtypes:
+        return
+    if msgtype is not None:
+        raise PerceptionError(f"{topic} carries {msgtype}, not {' or '.join(msgtypes)}")
+    others = ", ".join(sorted(name for name, kind in reader.topics.items() if kind in msgtypes)) or "none"
+    raise PerceptionError(f"{topic} is not in {reader.path}; topics of that kind: {others}")

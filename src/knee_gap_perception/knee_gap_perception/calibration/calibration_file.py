@@ -1,5 +1,6 @@
 """The calibration of one scope as one YAML file, with a hash by which results can say what they rest on."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -9,9 +10,10 @@ from typing import Any
 
 import numpy as np
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 from scipy.spatial.transform import Rotation
 
+from knee_gap_node.user_files import FileError, read_yaml
+from knee_gap_perception.calibration.calibration_rules import broken_rule
 from knee_gap_perception.calibration.intrinsics import Intrinsics
 from knee_gap_perception.calibration.notch import NotchShape
 from knee_gap_perception.calibration.rigid import Array, rigid
@@ -199,7 +201,12 @@ class Calibration:
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration; the file appears whole or not at all."""
+    """Write a calibration; the file appears whole or not at all.
+
+    Raises PerceptionError for one that could not be read again, and where the file cannot be written.
+    """
+    if flaw := broken_rule(calibration):
+        raise PerceptionError(f"this calibration cannot be used: {flaw}; record again")
     content = {"format": FORMAT, "hash": calibration.hash, **_to_dict(calibration)}
     partial = path.with_name(path.name + ".part")
     yaml = YAML()
@@ -210,12 +217,15 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
             yaml.dump(content, file)
         partial.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
         raise PerceptionError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def require_place(path: Path) -> None:
     """Raise PerceptionError where no calibration can be written, before it has taken minutes to make."""
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+    is_other = os.path.lexists(path) and not path.is_file()
+    if is_other or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise PerceptionError(
             f"{path} cannot be written: it must name a file in a folder that may be written"
         )
@@ -227,25 +237,25 @@ def load_calibration(path: Path) -> Calibration:
     Raises PerceptionError for a file that is missing, is no calibration, lacks values or was changed by hand.
     """
     try:
-        with path.open(encoding="utf-8") as file:
-            content = YAML(typ="safe", pure=True).load(file)
-    except OSError as error:
-        raise PerceptionError(f"the calibration {path} cannot be read: {error.strerror}") from None
-    except (YAMLError, UnicodeDecodeError):
-        raise PerceptionError(f"{path} is not YAML") from None
+        content = read_yaml(path)
+    except FileError as error:
+        raise PerceptionError(f"the calibration cannot be read: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise PerceptionError(f"{path} is no calibration: its format must be '{FORMAT}'")
     try:
         calibration = _from_dict(content)
     except KeyError as error:
         raise PerceptionError(f"the calibration {path} is incomplete: {error} is missing") from None
-    except (TypeError, ValueError, AttributeError) as error:
-        raise PerceptionError(f"the calibration {path} is incomplete or malformed: {error!r}") from None
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        reason = " ".join(str(error).split())
+        raise PerceptionError(f"the calibration {path} is incomplete or malformed: {reason}") from None
     if calibration.hash != content.get("hash"):
         raise PerceptionError(
             f"the calibration {path} does not match its hash: it was changed by hand or damaged; calibrate "
             "again"
         )
+    if flaw := broken_rule(calibration):
+        raise PerceptionError(f"the calibration {path} cannot be used: {flaw}; calibrate again")
     return calibration
 
 

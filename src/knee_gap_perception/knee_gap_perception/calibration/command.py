@@ -1,15 +1,17 @@
 """`calibrate`: a scope's calibration from recorded bags into one file, step by step or all at once."""
 
 import argparse
+import logging
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rosbags.serde import SerdeError
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser, finite
 from knee_gap_perception.calibration.boards import BOARD_SYNTAX, board_from_text
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
@@ -30,17 +32,24 @@ STEPS = {
     "hand_eye": "the lens on the tracked body, from a board that stands still",
     "oblique": "hand_eye, and the axis about which an oblique scope turns, from its notch or a second body",
     "pivot": "the scope's tip on the tracked body, from pivoting about it",
-    "all": "every step that the bag has data for",
+    "all": "every step that the bags have data for",
 }
+# What a recording is of; each may be a bag of its own.
+PARTS = ("board", "oblique", "pivot")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="calibrate", description=__doc__)
+def _parser() -> Parser:
+    parser = Parser(prog="calibrate", description=__doc__)
     steps = parser.add_subparsers(dest="step", required=True, metavar="STEP")
-    defaults = Request(Path())
+    defaults = Request({})
     for name, text in STEPS.items():
         step = steps.add_parser(name, help=text, description=text)
-        step.add_argument("bag", type=Path, help="recorded bag")
+        step.add_argument(
+            "bags",
+            nargs="+",
+            metavar="BAG",
+            help=f"recorded bag, folder or .mcap; or a bag a step, as STEP=BAG: {', '.join(PARTS)}",
+        )
         step.add_argument(
             "--into", type=Path, required=True, metavar="FILE", help="calibration to make or add to"
         )
@@ -60,10 +69,10 @@ def _parser() -> argparse.ArgumentParser:
             help=f"what the board lies in: {CHOICES} (FILE's; a new one's: air); best what it is used in",
         )
         step.add_argument("--fixed-intrinsics", action="store_true", help="keep the camera as it is in FILE")
-        step.add_argument("--time-offset", type=float, metavar="S", help="to start from, instead of FILE's")
-        step.add_argument("--max-offset", type=float, default=defaults.max_offset, metavar="S")
+        step.add_argument("--time-offset", type=finite, metavar="S", help="to start from, instead of FILE's")
+        step.add_argument("--max-offset", type=finite, default=defaults.max_offset, metavar="S")
         step.add_argument(
-            "--begin", type=float, default=0.0, metavar="S", help="part of the bag, from its start"
+            "--begin", type=finite, default=0.0, metavar="S", help="part of the bag, from its start"
         )
         step.add_argument("--end", type=float, default=float("inf"), metavar="S")
     show = steps.add_parser("show", help="what a calibration says, and its hash")
@@ -75,21 +84,25 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Calibrate; 0 when it is done."""
     arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="calibrate: %(message)s", stream=sys.stderr)
     try:
         if arguments.step == "show":
             calibration = load_calibration(arguments.file)
             _show_parameters(calibration) if arguments.parameters else _show(calibration)
         else:
             _calibrate(arguments)
-    except (PerceptionError, SerdeError) as error:
+    except (PerceptionError, OSError) as error:
         print(f"calibrate {arguments.step}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"calibrate {arguments.step}: stopped before the end", file=sys.stderr)
+        return 130
     return 0
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     request = Request(
-        bag=arguments.bag,
+        bags=_bags(arguments),
         board=board_from_text(arguments.board) if arguments.board else None,
         image_topic=arguments.image_topic,
         pose_topic=arguments.pose_topic,
@@ -109,7 +122,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     medium = _medium(given, calibration, arguments.into)
     recording = Recording(request, _progress)
     procedure = Procedure(recording, lambda line: print(f"  {line}", flush=True))
-    for step in _chosen(arguments.step, recording):
+    for step in chosen_steps(arguments.step, recording):
         print(step, flush=True)
         calibration = getattr(procedure, step)(calibration)
     if calibration is not None:
@@ -131,8 +144,27 @@ def _medium(given: Medium | None, calibration: Calibration | None, path: Path) -
     return given
 
 
-def _chosen(step: str, recording: Recording) -> list[str]:
-    """The steps to take: one, or all that the bag marks; in an unmarked bag, those of a board."""
+def _bags(arguments: argparse.Namespace) -> dict[str, Path]:
+    """Bags by the step that each was named for, "" for the one that holds all. Raises PerceptionError."""
+    named: dict[str, Path] = {}
+    for text in arguments.bags:
+        step, equals, path = text.partition("=")
+        if not equals or step not in PARTS or os.path.lexists(text):
+            step, path = "", text
+        if step in named:
+            wanted = ", ".join(f"{part}=BAG" for part in PARTS)
+            twice = f"two bags are named for the step {step}" if step else "of several bags each is one step"
+            raise PerceptionError(f"{twice}: name them {wanted}")
+        named[step] = Path(path)
+    if "" in named and len(named) > 1:
+        raise PerceptionError(f"{named['']}: which step is it? Of several bags each is named, as board=BAG")
+    if len(named) > 1 and (arguments.begin > 0.0 or arguments.end < float("inf")):
+        raise PerceptionError("--begin and --end are a part of one bag, and several are given")
+    return named
+
+
+def chosen_steps(step: str, recording: Recording) -> list[str]:
+    """The steps to take: one, or all that the bags have; in an unmarked bag, those of a board."""
     if step != "all":
         return [step]
     marked = recording.steps

@@ -1,8 +1,8 @@
 """The calibration that a node uses, and the medium that the scope is used in: named by parameters."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from knee_gap_node.user_files import FileError, expanded
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.medium import CHOICES, Medium, medium_of
@@ -54,7 +54,11 @@ class CalibrationParameters:
         """The calibration, None where none is named. Raises PerceptionError where it cannot be used."""
         if not self.calibration_file:
             return None
-        return load_calibration(Path(self.calibration_file).expanduser())
+        try:
+            path = expanded(self.calibration_file)
+        except FileError as error:
+            raise PerceptionError(f"calibration_file: {error}") from None
+        return load_calibration(path)
 
 
 def hash_or_none(calibration: Calibration | None) -> str:

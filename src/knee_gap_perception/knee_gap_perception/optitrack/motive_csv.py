@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from knee_gap_node.user_files import FileError, read_bytes
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.optitrack.body_source import BodyFrame, UnknownBodyError
 from knee_gap_perception.optitrack.up_axis import position_z_up, quaternion_z_up
@@ -33,6 +34,10 @@ EULER_ORDERS = tuple("".join(order) for order in permutations("XYZ"))
 BODY_TYPE = "rigid body"
 # What rounding to a millisecond leaves, and the last digit of a rate over a long take [s].
 ROUNDED_TIME = 0.6e-3
+# An hour of ten bodies at 240 Hz; the rows take some times as much memory.
+MOST_BYTES = 512 << 20
+# Of a frame's number, and its time [s].
+MOST_FRAME_AND_TIME = 1e9
 # Length of a message: a broken file's cells may be of any length and hold line breaks.
 MOST_WORDS = 300
 LABELS = ("type", "name", "id", "parent")
@@ -156,7 +161,7 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
         rate=rate,
         start=_start_time(header.get("Capture Start Time", "")),
         start_text=header.get("Capture Start Time", ""),
-        exported_count=int(count) if count.isdecimal() else None,
+        exported_count=int(count) if count.isdecimal() and len(count) < 10 else None,
         time=time,
         frame=cells[:, 0].astype(np.int64),
         bodies=tuple(_body(cells, body, order, scale, up_axis) for body in columns),
@@ -165,22 +170,29 @@ def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
 
 def _rows(path: Path) -> list[list[str]]:
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise TakeError(f"{path}: {error.strerror}") from None
-    text = _decoded(data)
+        text = _decoded(read_bytes(path, MOST_BYTES))
+    except FileError as error:
+        raise TakeError(str(error)) from None
     first_line = re.split("[\r\n]", text, maxsplit=1)[0]
     delimiter = max(",;\t", key=first_line.count)
-    rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=delimiter))
+    # A row of our own behind the last: where it does not come out, the text ends inside a quoted cell.
+    end = "" if text.endswith(("\n", "\r")) else "\n"
+    try:
+        rows = list(csv.reader(io.StringIO(f"{text}{end}{_END}", newline=""), delimiter=delimiter))
+    except csv.Error as error:
+        raise TakeError(f"{path.name}: no take of Motive: {error}") from None
+    is_quote_open = rows[-1] != [_END]
+    rows = rows if is_quote_open else rows[:-1]
     if not rows or not rows[0] or rows[0][0].strip() != "Format Version":
         raise TakeError(f"{path.name}: no take of Motive: its first line must start with 'Format Version'")
-    if not text.endswith(("\n", "\r")):
+    if is_quote_open or end:
         # Motive ends every line; half a number at the end would pass for a whole one.
         rows[-1] = [*rows[-1][:-1], _CUT]
     return [row for row in rows if any(cell.strip() for cell in row)]
 
 
 _CUT = "\x00cut"
+_END = "\x00end"
 
 
 def _decoded(data: bytes) -> str:
@@ -293,7 +305,7 @@ def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, 
         for column in needed:
             if row[column]:
                 cells[index, column] = _number(row[column])
-        if not np.isfinite(cells[index, :2]).all():
+        if not (np.abs(cells[index, :2]) <= MOST_FRAME_AND_TIME).all():
             raise TakeError(f"line {line}: no frame number and time, but '{row[0]}', '{row[1]}'")
     return cells
 

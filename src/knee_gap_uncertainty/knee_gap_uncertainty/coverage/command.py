@@ -1,6 +1,5 @@
 """`coverage`: how often the intervals hold the truth, cell by cell, as a table (CSV) and a plot."""
 
-import argparse
 import os
 import random
 import sys
@@ -11,6 +10,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser
+from knee_gap_node.user_files import FileError
 from knee_gap_uncertainty import gap_range, multi_view
 from knee_gap_uncertainty.coverage.cells import cells
 from knee_gap_uncertainty.coverage.measure import batches, measure
@@ -25,7 +26,7 @@ MOST_RUNS = 100_000
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; 0 when all was written, 2 for a user's mistake."""
-    parser = argparse.ArgumentParser(prog="coverage", description=__doc__)
+    parser = Parser(prog="coverage", description=__doc__)
     parser.add_argument(
         "--out", type=Path, default=Path("out/coverage"), help="where to write (out/coverage)"
     )
@@ -61,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         save_plot(options.out / "coverage.png", rows)
         if not options.so_far:
             unfinished.remove()
+    except FileError as error:
+        return refuse(str(error))
     except OSError as error:
         return refuse(f"cannot write to {options.out}: {error.strerror or error}")
     except KeyboardInterrupt:

@@ -1,11 +1,15 @@
 """A study that was interrupted: the batches that are done, from which the same command goes on."""
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from knee_gap_node.user_files import json_value, read_bytes
 from knee_gap_uncertainty.coverage.table import Row
+
+MOST_BYTES = 256 << 20
 
 
 class Unfinished:
@@ -15,16 +19,19 @@ class Unfinished:
         self.path = out / f"unfinished_{runs}_runs_seed_{seed}.jsonl"
 
     def read(self) -> dict[int, list[Row]]:
-        """Rows by the number of the batch, none where nothing was begun; a line cut off does not count."""
+        """Rows by the number of the batch, none where nothing was begun; a line cut off does not count.
+
+        Raises FileError where something else than a file stands in its place.
+        """
         found: dict[int, list[Row]] = {}
-        if not self.path.exists():
+        if not os.path.lexists(self.path):
             return found
-        for line in self.path.read_text().splitlines():
+        for line in read_bytes(self.path, MOST_BYTES).decode(errors="replace").splitlines():
             try:
-                number, rows = json.loads(line)
-            except ValueError:
+                number, rows = json_value(line)
+                found[int(number)] = [Row(**row) for row in rows]
+            except (ValueError, TypeError):
                 continue
-            found[number] = [Row(**row) for row in rows]
         return found
 
     def add(self, number: int, rows: Sequence[Row]) -> None:

@@ -1,6 +1,5 @@
 """`study`: the paper's tables and figures anew, as PNG, SVG, CSV and one HTML page."""
 
-import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from knee_gap_node.command_line import Parser
 from knee_gap_uncertainty.gap_range import warm_up
 from knee_gap_uncertainty.study import cloud_figures, other_figures
 from knee_gap_uncertainty.study.consistency import Check, checks
@@ -34,7 +34,7 @@ MOST_RUNS = 1_000_000
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; 0 when all was written, 2 for a user's mistake."""
-    parser = argparse.ArgumentParser(prog="study", description=__doc__)
+    parser = Parser(prog="study", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/study"), help="where to write (out/study)")
     parser.add_argument("--runs", type=int, default=1000, help="simulated runs of each scenario (1000)")
     parser.add_argument("--seed", type=int, default=SEED_OF_RUNS, help=f"seed of the runs ({SEED_OF_RUNS})")

@@ -5,6 +5,7 @@ records. What cannot be read is named once, in one line, and everything else is 
 """
 
 import heapq
+import io
 import logging
 import os
 import struct
@@ -16,12 +17,22 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import MAGIC_SIZE, breakup_chunk
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.summary import Summary
 
-from knee_gap_replay.errors import BagError
+from knee_gap_node.bag.errors import BagError
+from knee_gap_node.bag.mcap_chunk import MOST_CHUNK_BYTES, MOST_RECORD_BYTES, Budget, chunk_records
+from knee_gap_node.user_files import FileError, open_file, shown
 
 _LOG = logging.getLogger(__name__)
 _MAGIC = b"\x89MCAP0\r\n"
@@ -33,6 +44,9 @@ _CHECKSUM_SIZE = 4
 _OPCODES = frozenset(int(opcode) for opcode in Opcode)
 _INDEX_ENTRY_SIZE = 16
 _INDEX_HEAD_SIZE = 6
+# Records of the index, and messages that wait for their turn in time, held in memory at most.
+_MOST_INDEX_BYTES = 128 << 20
+_MOST_WAITING_BYTES = 512 << 20
 
 
 class Block(NamedTuple):
@@ -65,18 +79,23 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.losses: list[str] = []
+        self._told: set[str] = set()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.blocks: list[Block] = []
         self.counts: Counter[str] | None = None
         try:
-            self._size = path.stat().st_size
-            self._file: BinaryIO = path.open("rb")
-        except OSError as error:
-            raise BagError(f"{path}: {error.strerror}") from None
+            self._file: BinaryIO = open_file(path)
+        except FileError as error:
+            raise BagError(str(error)) from None
+        self._size = os.fstat(self._file.fileno()).st_size
+        self._budget = Budget(self._size)
         try:
             self._open()
+        except OSError as error:
+            self._file.close()
+            raise BagError(f"{shown(path)}: {error.strerror}") from None
         except BaseException:
             self._file.close()
             raise
@@ -110,11 +129,11 @@ class McapFile:
 
     def _open(self) -> None:
         if self._size == 0:
-            raise BagError(f"{self.path} is empty")
+            raise BagError(f"{shown(self.path)} is empty")
         head = self._file.read(MAGIC_SIZE + 1)
         if head[:MAGIC_SIZE] != _MAGIC:
             if head[MAGIC_SIZE:] != bytes([Opcode.HEADER]):
-                raise BagError(f"{self.path} is not an MCAP file")
+                raise BagError(f"{shown(self.path)} is not an MCAP file")
             self._lose("the first bytes of the file are damaged")
         summary = self._summary()
         if summary is not None and summary.chunk_indexes:
@@ -138,16 +157,17 @@ class McapFile:
     def _summary(self) -> Summary | None:
         """Return the index at the end of the file, None where it is absent or damaged."""
         try:
-            self._file.seek(0)
-            summary = make_reader(self._file).get_summary()
             self._file.seek(-(_FOOTER.size + MAGIC_SIZE), os.SEEK_END)
             _, _, start, _, told = _FOOTER.unpack(self._file.read(_FOOTER.size))
+            if not start > MAGIC_SIZE or self._size - start > _MOST_INDEX_BYTES:
+                return None
             self._file.seek(start)
-            checked = self._file.read(self._size - start - MAGIC_SIZE - _CHECKSUM_SIZE)
+            tail = self._file.read(self._size - start)
+            is_sound = told in (0, zlib.crc32(tail[: -MAGIC_SIZE - _CHECKSUM_SIZE]))
+            summary = _summary_of(tail) if is_sound else None
         except Exception:  # a cut or damaged end fails in many ways; the walk tells what is lost
             return None
-        is_sound = told in (0, zlib.crc32(checked))
-        return summary if is_sound and summary is not None and summary.channels else None
+        return summary if summary is not None and summary.channels else None
 
     def _use_index(self, summary: Summary) -> None:
         """Take the blocks from the index, and metadata from where it says."""
@@ -194,8 +214,10 @@ class McapFile:
             entries = max(0, length - _INDEX_HEAD_SIZE) // _INDEX_ENTRY_SIZE
             self.blocks[-1] = self.blocks[-1]._replace(message_count=self.blocks[-1].message_count + entries)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-            stream = ReadDataStream(self._file)
             try:
+                if length > MOST_RECORD_BYTES:
+                    raise BagError("it is too long")
+                stream = ReadDataStream(io.BytesIO(self._file.read(length)))
                 if opcode == Opcode.METADATA:
                     record = Metadata.read(stream)
                     self.metadata[record.name] = dict(record.metadata)
@@ -209,11 +231,14 @@ class McapFile:
         opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
         if length != block.length or opcode != (Opcode.CHUNK if block.is_chunk else Opcode.MESSAGE):
             raise BagError("its head is damaged")
-        stream = ReadDataStream(self._file)
+        if length > MOST_CHUNK_BYTES:
+            raise BagError(f"longer than {MOST_CHUNK_BYTES >> 20} MiB")
+        data = self._file.read(length)
+        if len(data) < length:
+            raise BagError("the file ends in it")
         if not block.is_chunk:
-            return [Message.read(stream, block.length)]
-        chunk = Chunk.read(stream)
-        return breakup_chunk(chunk, validate_crc=True)
+            return [Message.read(ReadDataStream(io.BytesIO(data)), length)]
+        return chunk_records(data, block.offset, self._budget)
 
     def _peek_definitions(self, block: Block) -> None:
         try:
@@ -230,8 +255,28 @@ class McapFile:
 
     def _lose(self, what: str) -> None:
         line = f"{self.path.name}: {what}"
-        self.losses.append(line)
-        _LOG.warning(line)
+        if line not in self._told:  # read again, it is lost again
+            self._told.add(line)
+            self.losses.append(line)
+            _LOG.warning(line)
+
+
+def _summary_of(tail: bytes) -> Summary:
+    """Return the index whose records, the footer and the magic are `tail`."""
+    summary = Summary()
+    # A chunk has no place here, and is not unpacked.
+    for record in StreamReader(io.BytesIO(tail), skip_magic=True, emit_chunks=True).records:
+        if isinstance(record, Statistics):
+            summary.statistics = record
+        elif isinstance(record, Schema):
+            summary.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            summary.channels[record.id] = record
+        elif isinstance(record, ChunkIndex):
+            summary.chunk_indexes.append(record)
+        elif isinstance(record, MetadataIndex):
+            summary.metadata_indexes.append(record)
+    return summary
 
 
 def in_time_order(files: Iterable[McapFile], topics: Collection[str] | None) -> Iterator[Entry]:
@@ -241,11 +286,15 @@ def in_time_order(files: Iterable[McapFile], topics: Collection[str] | None) -> 
         (block.start_ns, number, block) for number, file in by_number.items() for block in file.blocks
     )
     waiting: list[tuple[int, int, int, int, Entry]] = []
+    waiting_bytes = 0
     for start_ns, number, block in blocks:
-        while waiting and waiting[0][0] < start_ns:
+        # Blocks of a recorder overlap by seconds at most; of a file that claims more, not all is held.
+        while waiting and (waiting[0][0] < start_ns or waiting_bytes > _MOST_WAITING_BYTES):
+            waiting_bytes -= len(waiting[0][-1].data)
             yield heapq.heappop(waiting)[-1]
         for place, entry in enumerate(by_number[number].read(block)):
             if topics is None or entry.topic in topics:
+                waiting_bytes += len(entry.data)
                 heapq.heappush(waiting, (entry.time_ns, number, block.offset, place, entry))
     while waiting:
         yield heapq.heappop(waiting)[-1]
@@ -256,6 +305,6 @@ def mcap_files(folder: Path) -> list[Path]:
 
     def key(path: Path) -> tuple[str, int]:
         stem, _, number = path.stem.rpartition("_")
-        return (stem, int(number)) if number.isdigit() else (path.stem, -1)
+        return (stem, int(number)) if number.isdecimal() else (path.stem, -1)
 
     return sorted((folder / name for name in os.listdir(folder) if name.endswith(".mcap")), key=key)

@@ -1,0 +1,5 @@
+"""What goes wrong with bags."""
+
+
+class BagError(ValueError):
+    """A bag, topic, type or command that cannot be used; the message is one line and says why."""
