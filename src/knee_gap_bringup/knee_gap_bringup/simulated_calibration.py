@@ -24,9 +24,11 @@ from knee_gap_perception.calibration.calibration_file import (
 from knee_gap_perception.calibration.intrinsics import Intrinsics
 from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.medium import medium_of
 from knee_gap_replay.bag import BagReader
 from knee_gap_replay.errors import BagError
 from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.media import calibrated
 from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
 
 CALIBRATION_FILE = "calibration.yaml"
@@ -41,7 +43,8 @@ REPROJECTION_PX = 0.057
 def simulated_calibration(truth: SceneTruth, seed: int) -> Calibration:
     """A calibration of the scope and lens of a scene, wrong by errors drawn from what it states."""
     rng = np.random.default_rng([seed, 12])
-    lens, T_body_lens = truth.lens, truth.scope.body_to_lens()
+    # In the medium of its calibration, whose angles the file states.
+    lens, T_body_lens = calibrated(truth.lens), truth.scope.body_to_lens()
     focal, x, y = lens.focal_px, lens.centre_x_px, lens.centre_y_px
     camera = np.array([focal, focal, x, y, 0.0, 0.0, 0.0, 0.0]) + CAMERA * rng.standard_normal(8)
     twist = np.repeat([ROTATION, SHIFT], 3) / np.sqrt(3.0)
@@ -75,6 +78,7 @@ def simulated_calibration(truth: SceneTruth, seed: int) -> Calibration:
             view_count=96,
         ),
         clock=Clock(float(CLOCK * rng.standard_normal()), CLOCK, "simulated"),
+        medium=medium_of(truth.media.calibrated_in, "calibrated_in"),
     )
 
 
