@@ -33,6 +33,15 @@ class ParametersFile:
         if not self._by_node:
             raise BagError(f"{path} is not a ROS parameter file: nothing in it is called {_PARAMETERS}")
 
+    @classmethod
+    def with_calibration(cls, path: Path) -> "ParametersFile":
+        """Parameters that name nothing but a calibration file, for the nodes that use one."""
+        made = cls(None)
+        made._path = path
+        given = {"calibration_file": str(path)}
+        made._by_node = [("segmentation_node", given), ("tracking_node", given)]
+        return made
+
     def build(self, node: str, kinds: Sequence[type]) -> list[Any]:
         """Return one instance of each dataclass of `kinds`, which are the parameters of `node`.
 

@@ -16,21 +16,24 @@ from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
 
-# What a bag may have beside it: the parameters that fit its scope.
-_BESIDE = "scope.yaml"
+# What a bag may have beside it: the calibration of its scope, or the parameters that fit it.
+_CALIBRATION, _BESIDE = "calibration.yaml", "scope.yaml"
 
 
-def _parameters_path(arguments: argparse.Namespace) -> Path | None:
+def _parameters(arguments: argparse.Namespace) -> ParametersFile:
+    """The parameters of the file that is named, or of what lies beside the bag."""
     if arguments.params_file is not None:
-        return Path(arguments.params_file)
+        return ParametersFile(Path(arguments.params_file))
     bag = Path(arguments.bag)
-    beside = (bag if bag.is_dir() else bag.parent) / _BESIDE
-    return beside if beside.is_file() else None
+    folder = bag if bag.is_dir() else bag.parent
+    if (folder / _CALIBRATION).is_file():
+        return ParametersFile.with_calibration(folder / _CALIBRATION)
+    return ParametersFile(folder / _BESIDE if (folder / _BESIDE).is_file() else None)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     with BagReader(arguments.bag) as reader:
-        parameters = ParametersFile(_parameters_path(arguments))
+        parameters = _parameters(arguments)
         topics = topics_from(arguments, reader.topics)
         pipeline = GapPipeline.from_parameters(
             parameters, topics, namespace_from(arguments), with_mask=arguments.gap_mask
@@ -52,7 +55,8 @@ def _parser() -> Parser:
     parser.add_argument(
         "--params-file",
         metavar="YAML",
-        help=f"ROS parameters of the nodes; default {_BESIDE} in the bag",
+        help=f"ROS parameters of the nodes; default: {_CALIBRATION} in the bag as calibration_file, or else "
+        f"its {_BESIDE}",
     )
     parser.add_argument(
         "--gap-mask", action="store_true", help="write the mask of the gap in every image as well (gap_mask)"
