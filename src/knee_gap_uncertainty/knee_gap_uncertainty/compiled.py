@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import numba
 
@@ -15,6 +15,8 @@ FAST = {"nnan", "nsz", "reassoc", "contract"}
 
 # Packages whose sources a kernel may be built on; everything else has a version and does not change in place.
 OURS = "knee_gap_"
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @cache
@@ -84,6 +86,12 @@ def _file_of(name: str, importer: Path) -> Path | None:
     return next((file for file in (stem.with_suffix(".py"), stem / "__init__.py") if file.is_file()), None)
 
 
+@overload
+def compiled(function: Function, /) -> Function: ...
+@overload
+def compiled(
+    *, fastmath: bool = False, inlined: bool = False, nogil: bool = False
+) -> Callable[[Function], Function]: ...
 def compiled(
     function: Callable[..., Any] | None = None,
     *,
@@ -100,16 +108,18 @@ def compiled(
     `fastmath` lets sums be reordered; `inlined` copies the function into its callers, for the innermost ones
     that receive many arrays; `nogil` lets other threads run meanwhile.
     """
-    if function is None:
-        return lambda decorated: compiled(decorated, fastmath=fastmath, inlined=inlined, nogil=nogil)
-    function.__qualname__ += f"_{sources_digest(Path(function.__code__.co_filename))}"
     options: dict[str, Any] = {
         "error_model": "numpy",
         "fastmath": FAST if fastmath else False,
         "inline": "always" if inlined else "never",
         "nogil": nogil,
     }
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        return numba.njit(**options)(function)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        function.__qualname__ += f"_{sources_digest(Path(function.__code__.co_filename))}"
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:
+            return numba.njit(**options)(function)
+
+    return decorate if function is None else decorate(function)
