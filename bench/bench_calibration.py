@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
+from knee_gap_core.values.rigid_transforms import inverse, to_vector
+from knee_gap_perception.calibrate.command import main as calibrate
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.calibration.command import main as calibrate
-from knee_gap_perception.calibration.rigid import inverse, to_vector
-from knee_gap_simulation.calibration_bag import (
+from knee_gap_simulation.calibration.bag import (
     BOARDS,
     LENSES,
     CalibrationRecording,
@@ -39,14 +39,14 @@ def judged(recording: CalibrationRecording, folder: Path, views: int) -> tuple[f
     make_calibration_bag(bag, recording)
     board = ["--board", truth.board.text, "--into", str(into), "--views", str(views)]
     model = ["--model", MODELS[recording.lens]]
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         codes = [
             calibrate(["intrinsics", str(bag), *board, *model]),
             calibrate(["hand_eye", str(bag), *board]),
         ]
     if any(codes):
-        print(f"seed {recording.seed}: refused: {told.getvalue().strip().splitlines()[-1]}", flush=True)
+        print(f"seed {recording.seed}: refused: {output.getvalue().strip().splitlines()[-1]}", flush=True)
         return float("nan"), False
     found = load_calibration(into)
     lens, clock = found.require_lens(), found.clock

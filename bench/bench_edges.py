@@ -21,24 +21,24 @@ from kept_frames import frames_of
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from knee_gap_perception.camera import FisheyeCamera, bearing_jacobian
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeStatus, GapEdges
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
+from knee_gap_perception.camera.models import FisheyeCamera, bearing_jacobian
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_lens_pose
-from knee_gap_perception.poses import LensPose
-from knee_gap_replay.types import blank
-from knee_gap_simulation.bench import Bench, BenchFrame
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.truth import SceneTruth
+from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
+from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
-Array = npt.NDArray[np.float64]
 
 # Errors of the tracked lens: the paper's RMS lengths, per axis, and the lever from the body to the lens.
 POSITION_ERROR = float(np.hypot(0.0367e-3, 0.2 * np.radians(0.004)) / np.sqrt(3))
@@ -146,7 +146,7 @@ class GapCheck:
         """Note the true points (2, 3) [m] of a track."""
         self._truth[track_id] = float(np.linalg.norm(points[1] - points[0]))
 
-    def add(self, frame: BenchFrame, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
+    def add(self, frame: SimulatorFrame, pose: LensPose, edges: GapEdges, scores: Scores) -> None:
         """Hand an image's edges and pose to the estimator, as messages, and score what comes out."""
         self._looked_at[edges.stamp_ns] = frame.T_world_lens, edges
         posed = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), pose)
@@ -186,7 +186,7 @@ class GapCheck:
         )
 
 
-def lens_pose(frame: BenchFrame) -> LensPose:
+def lens_pose(frame: SimulatorFrame) -> LensPose:
     """The tracked pose of the lens, as tracking_node would publish it."""
     T = frame.T_world_lens_tracked
     covariance = np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3)
@@ -194,31 +194,31 @@ def lens_pose(frame: BenchFrame) -> LensPose:
     return LensPose(frame.stamp_ns, "world", "arthroscope_optical", T[:3, 3], quaternion, covariance)
 
 
-def score(bench: Bench, *, posed: bool, keep: Path | None = None) -> Scores:
+def score(simulator: KneeSimulator, *, posed: bool, keep: Path | None = None) -> Scores:
     """Run the detector over a bench and score every image."""
-    lens = bench.lens
+    lens = simulator.lens
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
-    detector, scores, check, track, points = GapEdgeDetector(), Scores(), GapCheck(bench.truth), 0, None
-    for frame in frames_of(bench, keep):
+    detector, scores, check, track, points = GapEdgeTracker(), Scores(), GapCheck(simulator.truth), 0, None
+    for frame in frames_of(simulator, keep):
         pose = lens_pose(frame)
         edges = detector.process(frame.stamp_ns, frame.image, camera, pose if posed else None)
         if frame.index % 10 == 0:
             scores.dice.append(dice(detector.gap_mask() > 0, frame.gap_mask))
         valid = edges.status is EdgeStatus.VALID
         if valid and edges.track_id != track:
-            track, points = edges.track_id, bench.points(frame, edges.pixels)
+            track, points = edges.track_id, simulator.points(frame, edges.pixels)
             scores.tracks += 1
             check.begin(track, points.points)
         check.add(frame, pose, edges, scores)
         if points is None:
             continue
-        sightings = bench.follow(points, frame, edges=False)
-        if sightings.visible.all():
+        observations = simulator.follow(points, frame, edges=False)
+        if observations.visible.all():
             scores.held.append(valid)
         if valid:
-            judge(scores, edges, camera, sightings.pixels)
+            judge(scores, edges, camera, observations.pixels)
     return scores.finish()
 
 
@@ -265,11 +265,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             total = Scores()
             for seed in tqdm(asked.seed, desc=f"level {level} {direction}", disable=not sys.stderr.isatty()):
                 try:
-                    bench = Bench(level, seed, direction, duration_s=asked.seconds, fps=asked.fps)
+                    simulator = KneeSimulator(level, seed, direction, duration_s=asked.seconds, fps=asked.fps)
                 except SimulationError as error:
                     print(f"bench_edges: {error}", file=sys.stderr)
                     return 1
-                total.add(score(bench, posed=not asked.without_pose, keep=asked.keep))
+                total.add(score(simulator, posed=not asked.without_pose, keep=asked.keep))
             print(f"level {level} {direction:8s} {total.line()}", flush=True)
     return 0
 

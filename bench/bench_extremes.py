@@ -19,10 +19,11 @@ from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.distance import cdist
 from tqdm import tqdm
 
-from knee_gap_uncertainty.angle_sets import SIGNS, Signs
-from knee_gap_uncertainty.error_cloud import Apex, error_clouds, trace_cloud
-from knee_gap_uncertainty.extremes import extremes
-from knee_gap_uncertainty.gap_range import (
+from knee_gap_uncertainty.numerics.vectors import vector
+from knee_gap_uncertainty.two_view.angle_sets import SIGNS, Signs
+from knee_gap_uncertainty.two_view.error_cloud import Apex, error_clouds, trace_cloud
+from knee_gap_uncertainty.two_view.extremes import extremes
+from knee_gap_uncertainty.two_view.gap_range import (
     GapRange,
     axes_along,
     cloud_range,
@@ -30,11 +31,10 @@ from knee_gap_uncertainty.gap_range import (
     reversed_views,
     warm_up,
 )
-from knee_gap_uncertainty.slices import slice_spokes
-from knee_gap_uncertainty.translation_volume import displacements
-from knee_gap_uncertainty.triangulation import triangulate
-from knee_gap_uncertainty.two_views import TwoViews, two_views
-from knee_gap_uncertainty.vectors import vector
+from knee_gap_uncertainty.two_view.slices import slice_spokes
+from knee_gap_uncertainty.two_view.translation_volume import displacements
+from knee_gap_uncertainty.two_view.triangulation import triangulate
+from knee_gap_uncertainty.two_view.two_views import TwoViews, two_views
 
 Cloud = npt.NDArray[np.float64]
 

@@ -19,23 +19,28 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from knee_gap_bringup.comparison import true_gap
-from knee_gap_replay.bag import BagReader
-from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.node.parameters_file import ParametersFile
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_replay.pipeline import PARAMETERS, GapPipeline
 from knee_gap_replay.processing import by_stamp
 from knee_gap_replay.topics import InputTopics
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE, PARAMETERS_FILE
-from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.recordings.recording import (
+    BODY_POSE,
+    CAMERA_INFO,
+    IMAGE,
+    LENS_POSE_TRUE,
+    PARAMETERS_FILE,
+)
+from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.messages import stamp_ns
 
-Array = npt.NDArray[np.float64]
 LARGEST_SHARE, LARGEST_MISS = 1e-3, 0.5e-3  # of a creeping body: share of VALID, and by how much [m]
 SPACE = "/knee_gap"
 

@@ -14,14 +14,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from knee_gap_simulation.bench import Bench
+from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.section_truth import SectionTruth, edges_at_section, section_truth
-from knee_gap_simulation.tissue_samples import LOWER_SIDE, UPPER_SIDE
-
-Array = npt.NDArray[np.float64]
+from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.recordings.section_truth import SectionTruth, edges_at_section, section_truth
+from knee_gap_simulation.surfaces.tissue_samples import LOWER_SIDE, UPPER_SIDE
 
 INSET = float(np.radians(2.0))  # of the tracked points from their edges
 CURVE_REACH = 2.0e-3  # [m] around an edge point: its side's curve in the plane of the section
@@ -44,12 +42,12 @@ class Knee(NamedTuple):
 
 def knee(level: int, seed: int, time: float, inset: float) -> Knee:
     """The truth of a knee at a time [s] of its hand's travel."""
-    bench = Bench(level, seed)
-    T_scene_lens = bench.pose(time)
-    lens, scene = T_scene_lens[:3, 3], bench.scene
-    middle = scene.ridge(0.0)[0] - (0.0, 0.5 * (bench.settings.gap or 0.0), 0.0)
-    pixel = bench.lens.pixels(T_scene_lens[:3, :3].T @ (middle - lens))
-    edges = edges_at_section(scene, bench.lens, T_scene_lens, pixel)
+    simulator = KneeSimulator(level, seed)
+    T_scene_lens = simulator.pose(time)
+    lens, scene = T_scene_lens[:3, 3], simulator.scene
+    middle = scene.ridge(0.0)[0] - (0.0, 0.5 * (simulator.settings.gap or 0.0), 0.0)
+    pixel = simulator.lens.pixels(T_scene_lens[:3, :3].T @ (middle - lens))
+    edges = edges_at_section(scene, simulator.lens, T_scene_lens, pixel)
     truth = section_truth(scene, T_scene_lens, edges)
     half = 0.5 * float(np.arccos(np.clip(edges[0] @ edges[1], -1.0, 1.0)))
     # The tracked points: outward from the edges within the plane of the section.
@@ -76,7 +74,7 @@ def knee(level: int, seed: int, time: float, inset: float) -> Knee:
         float(np.linalg.norm(points[1] - points[0])),
         np.arccos(np.clip(cosines, -1.0, 1.0)),
         np.array(radii),
-        bench.nearest_distance,
+        simulator.nearest_distance,
     )
 
 

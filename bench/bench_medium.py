@@ -15,20 +15,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.camera import Camera, bearing_jacobian, camera_from_info, camera_in_medium
-from knee_gap_perception.camera_errors import WINDOW_TILT, CameraErrors, pupil_shift
-from knee_gap_perception.medium import AIR, SALINE
-from knee_gap_simulation.lens import Lens
-from knee_gap_simulation.recording import camera_info_message
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_perception.camera.camera_errors import WINDOW_TILT, CameraErrors, pupil_shift
+from knee_gap_perception.camera.medium import AIR, SALINE
+from knee_gap_perception.camera.models import Camera, bearing_jacobian, camera_from_info, camera_in_medium
+from knee_gap_simulation.recordings.recording import camera_info_message
+from knee_gap_simulation.scope.lens import Lens
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.scope_calibration import ScopeCalibration
-
-Array = npt.NDArray[np.float64]
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
 GAP = 0.004
 ARMS = (np.inf, 0.090, 0.060, 0.040)
@@ -128,11 +126,11 @@ def two_views(rng: np.random.Generator, depth: float, travel: float, arm: float)
     lenses = np.array([position for position, _ in poses])
     pixels = np.array([window.pixels((points - position) @ turn) for position, turn in poses])
     pixels = pixels + PIXEL_NOISE * rng.standard_normal((2, 2, 2))
-    told = {}
+    reported = {}
     for name, camera in CAMERAS.items():
         bearings = np.array([camera.bearings(p) @ turn.T for p, (_, turn) in zip(pixels, poses, strict=True)])
-        told[name] = midpoint_gap(lenses, bearings) / GAP - 1.0
-    return told
+        reported[name] = midpoint_gap(lenses, bearings) / GAP - 1.0
+    return reported
 
 
 def track(rng: np.random.Generator, way: Way, depth: float, travel: float, arm: float) -> list[GapEstimate]:
@@ -143,7 +141,7 @@ def track(rng: np.random.Generator, way: Way, depth: float, travel: float, arm: 
     covariance[2, 2] += way.shift**2
     estimator.add_calibration(ScopeCalibration("tracking_node", "a" * 64, covariance, 4e-5))
     pose_covariance = np.diag(np.repeat([TRACKER[0] ** 2 / 3, TRACKER[1] ** 2 / 3], 3))
-    told: list[GapEstimate] = []
+    reported: list[GapEstimate] = []
     for k in range(IMAGES):
         stamp = 10**18 + round(k / RATE_HZ * 1e9)
         for late in (-2e-3, 2e-3):
@@ -153,7 +151,7 @@ def track(rng: np.random.Generator, way: Way, depth: float, travel: float, arm: 
             turned = Rotation.from_rotvec(TRACKER[1] / np.sqrt(3) * rng.standard_normal(3)).as_matrix() @ turn
             quaternion = Rotation.from_matrix(turned).as_quat()
             at = stamp + round(late * 1e9)
-            told += estimator.add_pose(LensPose(at, "world", seen_from, quaternion, pose_covariance), at)
+            reported += estimator.add_pose(LensPose(at, "world", seen_from, quaternion, pose_covariance), at)
             if late > 0:
                 continue
             position, turn = pose(travel * (k / (IMAGES - 1) - 0.5), arm)
@@ -167,8 +165,8 @@ def track(rng: np.random.Generator, way: Way, depth: float, travel: float, arm: 
             edges = EdgeObservation(
                 stamp, 1, True, bearings, covariances, bound, camera_errors=way.errors.of(bearings)
             )
-            told += estimator.add_edges(edges, stamp)
-    return told
+            reported += estimator.add_edges(edges, stamp)
+    return reported
 
 
 def main(argv: Sequence[str] | None = None) -> int:

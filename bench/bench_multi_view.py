@@ -10,9 +10,9 @@ from itertools import product
 import numpy as np
 from scipy.optimize import least_squares
 
-from knee_gap_uncertainty.confidence_interval import confidence_interval
-from knee_gap_uncertainty.multi_view import fit
-from knee_gap_uncertainty.views import Views
+from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval
+from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
+from knee_gap_uncertainty.multi_view.views import Views
 
 POINTS = np.array([[0.0, -0.002, 0.010], [0.0005, 0.002, 0.011]])
 SIGMA_BEARING, SIGMA_LENS, SIGMA_TURN = np.radians(0.3), 2.1e-5, 4e-5

@@ -16,15 +16,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.calibration.notch import common_shape, find_notch
-from knee_gap_perception.calibration.observations import wrapped
-from knee_gap_perception.field_of_view import find_field_of_view
-from knee_gap_perception.notch_follower import NotchFollower
-from knee_gap_simulation.calibration_bag import CalibrationMotion, CalibrationRecording, calibration_truth
-from knee_gap_simulation.calibration_scene import BoardCamera
-from knee_gap_simulation.imaging import jpeg
-
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Image
+from knee_gap_perception.calibrate.observations import wrapped
+from knee_gap_perception.image.field_of_view import find_field_of_view
+from knee_gap_perception.scope_rotation.notch import common_shape, find_notch
+from knee_gap_perception.scope_rotation.notch_tracker import NotchFollower
+from knee_gap_simulation.calibration.bag import CalibrationMotion, CalibrationRecording, calibration_truth
+from knee_gap_simulation.calibration.scene import BoardCamera
+from knee_gap_simulation.scope.imaging import jpeg
 
 PERIOD_NS = 33_333_333
 FOR_SHAPE = 8  # images from which the notch's shape is told, as a calibration does
@@ -75,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"seed {seed}: no notch in the first {FOR_SHAPE} images")
             return 1
         follower = NotchFollower(shape)
-        sights = [follower.look((k + 1) * PERIOD_NS, image) for k, image in enumerate(images)]
-        off = [s.angle - angle for s, angle in zip(sights, angles, strict=True) if s.seen]
+        observations = [follower.look((k + 1) * PERIOD_NS, image) for k, image in enumerate(images)]
+        off = [s.angle - angle for s, angle in zip(observations, angles, strict=True) if s.seen]
         errors.append(np.degrees(wrapped(np.array(off))))
         shown += len(images)
     off_deg = np.concatenate(errors)

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from bench_edges import lens_pose
 
-from knee_gap_perception.camera import FisheyeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edge_parameters import EdgeParameters
-from knee_gap_perception.edges import EdgeStatus
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import FisheyeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.edge_tracking.overlay import draw_overlay
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.messages import image_from_compressed
-from knee_gap_perception.overlay import draw_overlay
-from knee_gap_simulation.bench import Bench
+from knee_gap_simulation.knee_simulator import KneeSimulator
 
 Result = TypeVar("Result")
 
@@ -37,9 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=6, help="times they are gone through, to and fro")
     asked = parser.parse_args(argv)
     cv2.setNumThreads(1)
-    bench = Bench(asked.level, asked.seed, duration_s=asked.images / 60.0, fps=60.0)
-    frames = list(bench.frames())
-    lens = bench.lens
+    simulator = KneeSimulator(asked.level, asked.seed, duration_s=asked.images / 60.0, fps=60.0)
+    frames = list(simulator.frames())
+    lens = simulator.lens
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     decoding: list[float] = []
     following: dict[str, list[float]] = {}
     for guide in ("with poses", "images alone"):
-        detector, following[guide], valid = GapEdgeDetector(), [], 0
+        detector, following[guide], valid = GapEdgeTracker(), [], 0
         for frame in frames[:2]:
             detector.process(frame.index, frame.image, camera)
         detector.end_track()
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             valid += edges.status is EdgeStatus.VALID
         print(f"{guide}: {valid} of {len(order)} images valid")
     # As long as no gap is found every image is searched.
-    searcher = GapEdgeDetector(EdgeParameters(minimum_confidence=1.0))
+    searcher = GapEdgeTracker(EdgeParameters(minimum_confidence=1.0))
     searching = [
         timed(partial(searcher.process, 16_666_667 * index, frame.image, camera))[0]
         for index, frame in enumerate(frames)
@@ -70,10 +70,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     masking, mask = timed(detector.gap_mask)
     drawing, _ = timed(partial(draw_overlay, order[-1].image, edges, mask, "", camera))
     print(f"{len(order)} images of {lens.width_px}x{lens.height_px}, level {asked.level}, one core")
-    print(f"decoding alone       {told(decoding)}")
+    print(f"decoding alone       {formatted(decoding)}")
     for guide, seconds in following.items():
-        print(f"edges, {guide:13s} {told(seconds)}")
-    print(f"search, no gap       {told(searching)}")
+        print(f"edges, {guide:13s} {formatted(seconds)}")
+    print(f"search, no gap       {formatted(searching)}")
     ratio = percentile(following["with poses"], 50) / percentile(decoding, 50)
     print(f"edges / decoding     {ratio:5.2f}")
     print(f"mask, when asked for {1e3 * masking:5.1f} ms; overlay, when asked for {1e3 * drawing:.1f} ms")
@@ -87,7 +87,7 @@ def timed(work: Callable[[], Result]) -> tuple[float, Result]:
     return process_time() - start, result
 
 
-def told(seconds: list[float]) -> str:
+def formatted(seconds: list[float]) -> str:
     """Median and 99th percentile in milliseconds."""
     return f"p50 {percentile(seconds, 50):5.1f} ms  p99 {percentile(seconds, 99):5.1f} ms"
 

@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.camera import FisheyeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeStatus
-from knee_gap_perception.overlay import draw_overlay
-
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import FisheyeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.edge_tracking.overlay import draw_overlay
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data" / "images"
 DEFAULT = (RECORDINGS / "sinus_endoscope", RECORDINGS / "laparoscope_video" / "endo.mp4")
@@ -46,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for path in paths:
         frames = spread(list(pictures(path)), asked.frames)
         tiles += [looked_at(frame) for frame in frames]
-        told(path.name, [held_still(frame, asked.still, seed) for seed, frame in enumerate(frames)])
+        print_tracks(path.name, [held_still(frame, asked.still, seed) for seed, frame in enumerate(frames)])
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(asked.out), sheet(tiles))
     print(f"{asked.out}: {len(tiles)} frames")
@@ -77,7 +76,7 @@ def camera_for(image: Image) -> FisheyeCamera:
 
 def looked_at(image: Image) -> Image:
     """The frame with all that is found in it."""
-    detector, camera = GapEdgeDetector(), camera_for(image)
+    detector, camera = GapEdgeTracker(), camera_for(image)
     edges = detector.process(0, image, camera)
     drawn = draw_overlay(image, edges, detector.gap_mask(), detector.reason, camera)
     scale = TILE_PX / drawn.shape[1]
@@ -88,7 +87,7 @@ def looked_at(image: Image) -> Image:
 
 def held_still(image: Image, count: int, seed: int) -> npt.NDArray[np.float64] | None:
     """Pixels (n, 2, 2) of the points while a frame is repeated; None where no points are found."""
-    detector, camera, rng = GapEdgeDetector(), camera_for(image), np.random.default_rng(seed)
+    detector, camera, rng = GapEdgeTracker(), camera_for(image), np.random.default_rng(seed)
     found = []
     for k in range(count):
         gain = 1.0 + BREATHING * np.sin(k / 9.0)
@@ -100,7 +99,7 @@ def held_still(image: Image, count: int, seed: int) -> npt.NDArray[np.float64] |
     return np.stack(found) if found else None
 
 
-def told(name: str, tracks: list[npt.NDArray[np.float64] | None]) -> None:
+def print_tracks(name: str, tracks: list[npt.NDArray[np.float64] | None]) -> None:
     """Print in how many frames points were found and how still they were."""
     known = [track for track in tracks if track is not None]
     print(f"{name}: points in {len(known)} of {len(tracks)} frames")

@@ -24,15 +24,13 @@ from bench_real import RECORDINGS, pictures
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.camera import Camera, PinholeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeStatus
-from knee_gap_perception.local_plane import View
-from knee_gap_perception.point_track import PointTrack
-from knee_gap_perception.poses import LensPose, rigid_transform
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Array, Image
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_core.values.poses import LensPose, rigid_transform
+from knee_gap_perception.camera.models import Camera, PinholeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.point_tracking.point_tracker import PointTracker
+from knee_gap_perception.point_tracking.tangent_plane import View
 
 DEPTH = 0.012  # [m] to which the median depth of the reconstruction is scaled
 POSITION_ERROR, ROTATION_ERROR = 0.05e-3, np.radians(0.05)  # assumed of the reconstruction's poses [m], [rad]
@@ -80,10 +78,10 @@ def reconstruction(folder: Path) -> Reconstruction:
     visible = [int(word) for word in (folder / "visible_view_indexes").read_text().split()]
     # The file's "poses[]:" has no value of its own.
     text = (folder / "motion.yaml").read_text().replace("poses[]:", "poses:")
-    told = YAML(typ="safe").load(text)["poses"]
+    formatted = YAML(typ="safe").load(text)["poses"]
     poses = []
     for number in numbers:
-        pose = told[f"poses[{visible.index(number)}]"]
+        pose = formatted[f"poses[{visible.index(number)}]"]
         position = [pose["position"][k] for k in "xyz"]
         poses.append(rigid_transform(position, [pose["orientation"][k] for k in "xyzw"]))
     lines = (folder / "structure.ply").read_text().split("end_header\n")[1].splitlines()
@@ -131,28 +129,28 @@ def against_reconstruction(scene: Reconstruction, count: int, out: Path) -> None
         if (np.minimum(start, size - start) < MARGIN).any():
             continue
         followed += 1
-        track = PointTrack(greys[first], start, DARK, scene.camera, views[first])
+        track = PointTracker(greys[first], start, DARK, scene.camera, views[first])
         path = [start]
         for image in range(first + 1, len(greys)):
-            sighting = track.follow(greys[image], scene.camera, views[image])
+            observation = track.follow(greys[image], scene.camera, views[image])
             if scene.seen[image, point]:
-                held.append(sighting.seen)
-            if not sighting.seen:
+                held.append(observation.seen)
+            if not observation.seen:
                 continue
-            path.append(sighting.position)
-            lines.append(off_the_line(scene, first, start, image, sighting.position))
+            path.append(observation.position)
+            lines.append(off_the_line(scene, first, start, image, observation.position))
             if scene.seen[image, point]:
-                away = sighting.position - projected(scene, image, point)
+                away = observation.position - projected(scene, image, point)
                 errors.append(float(np.linalg.norm(away)))
-                nees.append(float(away @ np.linalg.solve(sighting.covariance, away)) / 2)
+                nees.append(float(away @ np.linalg.solve(observation.covariance, away)) / 2)
         cv2.polylines(drawn, [np.rint(path).astype(np.int32)], False, (0, 255, 0), 2)
         cv2.circle(drawn, (round(path[-1][0]), round(path[-1][1])), 5, (0, 0, 255), 2)
     degrees = np.degrees(scene.camera.radians_per_pixel(size / 2))
     print(
         f"structure from motion: {followed} points through {len(greys)} images, seen in "
         f"{100 * np.mean(held):.0f} % of the images that show them\n"
-        f"  reprojection {told(errors)} ({degrees:.3f} deg a pixel), NEES median {np.median(nees):.2f}\n"
-        f"  epipolar     {told(lines)}"
+        f"  reprojection {formatted(errors)} ({degrees:.3f} deg a pixel), NEES median {np.median(nees):.2f}\n"
+        f"  epipolar     {formatted(lines)}"
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(out), drawn)
@@ -161,7 +159,7 @@ def against_reconstruction(scene: Reconstruction, count: int, out: Path) -> None
 
 def gap_points(scene: Reconstruction) -> None:
     """The two points that are chosen beside the cleft, against the poses."""
-    detector, lines, bounds, starts = GapEdgeDetector(), [], [], np.zeros((2, 2))
+    detector, lines, bounds, starts = GapEdgeTracker(), [], [], np.zeros((2, 2))
     begun: dict[int, int] = {}
     covariance = np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3)
     for index, image in enumerate(scene.images):
@@ -180,7 +178,7 @@ def gap_points(scene: Reconstruction) -> None:
     if lines:
         inside = 100 * np.mean(np.array(lines) <= np.array(bounds))
         print(
-            f"beside the cleft: {len(begun)} tracks; epipolar {told(lines)}\n"
+            f"beside the cleft: {len(begun)} tracks; epipolar {formatted(lines)}\n"
             f"  within angular_error, median {np.median(bounds):.1f} px, in {inside:.0f} %"
         )
 
@@ -228,15 +226,15 @@ def followed_alone(greys: list[Image]) -> Iterator[Array]:
     inside[(greys[0] < 2 * DARK) | (greys[0] > 200)] = 0
     for corner in cv2.goodFeaturesToTrack(greys[0], 40, 0.02, 40, mask=inside)[:, 0]:
         start = np.asarray(corner, np.float64)
-        track = PointTrack(greys[0], start, DARK, camera, None)
+        track = PointTracker(greys[0], start, DARK, camera, None)
         path = [start]
         for grey in greys[1:]:
-            sighting = track.follow(grey, camera, None)
-            path.append(sighting.position if sighting.seen else np.full(2, np.nan))
+            observation = track.follow(grey, camera, None)
+            path.append(observation.position if observation.seen else np.full(2, np.nan))
         yield np.stack(path)
 
 
-def told(errors: Sequence[float]) -> str:
+def formatted(errors: Sequence[float]) -> str:
     """Median, root mean square of the better 95 %, and the worst twentieth."""
     values = np.sort(np.asarray(errors))
     kept = values[: max(1, int(0.95 * len(values)))]

@@ -21,21 +21,18 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from kept_frames import frames_of
 from scipy.stats import beta
 from tqdm import tqdm
 
-from knee_gap_perception.camera import Camera, FisheyeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edge_parameters import EdgeParameters
-from knee_gap_perception.edges import EdgeStatus
-from knee_gap_simulation.bench import FROM_SEED, Bench, BenchFrame
+from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import Camera, FisheyeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.motion import TravelDirection
-
-Image = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
+from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator, SimulatorFrame
+from knee_gap_simulation.scope.hand_motion import TravelDirection
 
 STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese")
 NEEDED = (0.97, 0.96, 0.94, 0.88)
@@ -119,15 +116,15 @@ def interval(count: float, of: int) -> tuple[float, float]:
     return low, high
 
 
-def keep_picture(folder: Path, name: str, frame: BenchFrame, camera: Camera) -> None:
+def keep_picture(folder: Path, name: str, frame: SimulatorFrame, camera: Camera) -> None:
     """The picture of a wrong decision, by itself and with the mask's outline and the confidence."""
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     detector.process(0, frame.image, camera)
     drawn = frame.image.copy()
     outlines, _ = cv2.findContours(detector.gap_mask(), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(drawn, outlines, -1, (0, 255, 0), 1)
-    told = detector.reason or f"confidence {detector.confidence:.2f}"
-    cv2.putText(drawn, told, (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
+    words = detector.reason or f"confidence {detector.confidence:.2f}"
+    cv2.putText(drawn, words, (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
     folder.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(folder / f"{name}.png"), np.hstack([frame.image, drawn]))
 
@@ -162,7 +159,9 @@ def scores_and_decisions(asked: argparse.Namespace) -> list[Judged]:
     return judged
 
 
-def rendered(level: int, asked: argparse.Namespace, *, is_open: bool) -> Iterator[tuple[BenchFrame, Camera]]:
+def rendered(
+    level: int, asked: argparse.Namespace, *, is_open: bool
+) -> Iterator[tuple[SimulatorFrame, Camera]]:
     """Frames of every seed and direction, spread over the travel."""
     jobs = [(direction, seed) for direction in asked.travel_direction for seed in asked.seed]
     for direction, seed in tqdm(jobs, desc=f"level {level}", disable=not sys.stderr.isatty()):
@@ -171,37 +170,37 @@ def rendered(level: int, asked: argparse.Namespace, *, is_open: bool) -> Iterato
 
 def rendered_one(
     level: int, seed: int, direction: str, asked: argparse.Namespace, *, is_open: bool
-) -> Iterator[tuple[BenchFrame, Camera]]:
+) -> Iterator[tuple[SimulatorFrame, Camera]]:
     """Frames of one joint, spread over the travel; none, and it says so, where the travel does not fit."""
     try:
-        bench = Bench(level, seed, direction, gap=FROM_SEED if is_open else None)
+        simulator = KneeSimulator(level, seed, direction, gap=FROM_SEED if is_open else None)
     except SimulationError as error:
         print(f"bench_segmentation: seed {seed} {direction} left out: {error}", file=sys.stderr)
         return
-    lens = bench.lens
+    lens = simulator.lens
     camera = FisheyeCamera(
         lens.width_px, lens.height_px, lens.focal_px, lens.focal_px, lens.centre_x_px, lens.centre_y_px
     )
-    step = max(1, bench.frame_count // asked.frames)
+    step = max(1, simulator.frame_count // asked.frames)
     # Where the lens begins its travel a joint looks other than in the middle: every seed has its own places.
     place = asked.at if asked.at is not None else seed * GOLDEN % 1.0
     start = int(step * (place if asked.decision else 0.5))
-    for frame in frames_of(bench, asked.keep, start, step):
+    for frame in frames_of(simulator, asked.keep, start, step):
         yield frame, camera
 
 
-def dice_of(frame: BenchFrame, camera: Camera, parameters: EdgeParameters) -> float:
+def dice_of(frame: SimulatorFrame, camera: Camera, parameters: EdgeParameters) -> float:
     """Dice of a frame's mask."""
-    detector = GapEdgeDetector(parameters)
+    detector = GapEdgeTracker(parameters)
     detector.process(0, frame.image, camera)
     mask, truth = detector.gap_mask() > 0, frame.gap_mask
     return float(2 * (mask & truth).sum() / max(mask.sum() + truth.sum(), 1))
 
 
-def judge(frame: BenchFrame, camera: Camera) -> Judged:
+def judge(frame: SimulatorFrame, camera: Camera) -> Judged:
     """Decide on a frame by itself, and compare with its truth."""
     confidence, found = decide(frame.image, camera)
-    detector = GapEdgeDetector(replace(EdgeParameters(), minimum_confidence=0.0))
+    detector = GapEdgeTracker(replace(EdgeParameters(), minimum_confidence=0.0))
     edges = detector.process(0, frame.image, camera)
     middle = np.rint(edges.pixels.mean(axis=0)) if edges.status is EdgeStatus.VALID else None
     is_gap = middle is not None and bool(frame.gap_mask[int(middle[1]), int(middle[0])])
@@ -210,7 +209,7 @@ def judge(frame: BenchFrame, camera: Camera) -> Judged:
 
 def decide(image: Image, camera: Camera) -> tuple[float, bool]:
     """Confidence of the best section of a picture, and whether points were chosen."""
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     edges = detector.process(0, image, camera)
     return detector.confidence, edges.status is EdgeStatus.VALID
 
@@ -256,8 +255,8 @@ def print_reliability(judged: Sequence[Judged]) -> None:
         inside = [f for f in known if low <= f.confidence < high or (high == 1.0 and f.confidence == 1.0)]
         right = sum(frame.is_gap for frame in inside) / gaps
         wrong = sum(not frame.is_gap for frame in inside) / others
-        told = f"{right / (right + wrong):.2f}" if inside else "-"
-        print(f"{low:.1f} to {high:.1f}   {len(inside):8d}   {told:>5s}")
+        words = f"{right / (right + wrong):.2f}" if inside else "-"
+        print(f"{low:.1f} to {high:.1f}   {len(inside):8d}   {words:>5s}")
 
 
 if __name__ == "__main__":

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from knee_gap_bringup.processes import Processes, StartError, executable
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.errors import BagError
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 from knee_gap_uncertainty.messages import stamp_ns
 
 ROOT = Path(__file__).parents[1]
@@ -62,8 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"bench_transport: {error}", file=sys.stderr)
         return 1
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; at 60 Hz an image comes every 16.7 ms")
-    told("receive and decode only", floor)
-    told(", ".join(nodes), full)
+    print_run("receive and decode only", floor)
+    print_run(", ".join(nodes), full)
     return 0
 
 
@@ -159,7 +159,7 @@ def counted(bag: Path, recording: Path, spent: dict[str, float]) -> Run:
     return Run(sent, edges, valid, latencies, {name: cpu / seconds for name, cpu in spent.items()})
 
 
-def told(name: str, result: Run) -> None:
+def print_run(name: str, result: Run) -> None:
     """Print a run."""
     lost = result.sent - result.edges
     print(

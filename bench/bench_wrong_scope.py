@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from knee_gap_uncertainty.gap_estimate import GapStatus
-from knee_gap_uncertainty.simulated_scope import POINTS, wrong_scope
+from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_uncertainty.studies.wrong_calibration.simulated_scope import POINTS, wrong_scope
 
 # Shift [m], turn [rad], clock [s], RMS.
 SCOPES = {
@@ -38,10 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, (shift, turn, clock) in SCOPES.items():
         ended = valid = missed = images = 0
         for seed in range(arguments.first, arguments.first + arguments.tracks):
-            told = wrong_scope(seed, shift, turn, clock)
-            ended += any(one.status is GapStatus.JOINT_MOVED for one in told)
-            numbers = [one for one in told if one.status is GapStatus.VALID]
-            images, valid = images + len(told), valid + len(numbers)
+            estimates = wrong_scope(seed, shift, turn, clock)
+            ended += any(one.status is GapStatus.JOINT_MOVED for one in estimates)
+            numbers = [one for one in estimates if one.status is GapStatus.VALID]
+            images, valid = images + len(estimates), valid + len(numbers)
             missed += sum(not one.gap_min <= gap <= one.gap_max for one in numbers)
         print(
             f"{name}: JOINT_MOVED in {ended} of {arguments.tracks} tracks; {valid} of {images} images valid, "

@@ -18,16 +18,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knee_gap_perception.calibration import hand_eye, intrinsics
-from knee_gap_perception.calibration.boards import BoardView
-from knee_gap_perception.calibration.hand_eye import HandEye, calibrate_hand_eye
-from knee_gap_perception.calibration.hand_eye_bundle import TrackedView
-from knee_gap_perception.calibration.intrinsics import fit_intrinsics
-from knee_gap_perception.calibration.lens_error import lens_errors
-from knee_gap_perception.calibration.lens_model import LensModel
+from knee_gap_perception.calibrate.measurements.boards import BoardView
+from knee_gap_perception.calibrate.solvers import hand_eye, intrinsics
+from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, calibrate_hand_eye
+from knee_gap_perception.calibrate.solvers.hand_eye_bundle import TrackedView
+from knee_gap_perception.calibrate.solvers.intrinsics import fit_intrinsics
+from knee_gap_perception.calibrate.solvers.lens_error import lens_errors
+from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_uncertainty.errors import MeasurementError
-from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 Views = list[TrackedView]
 MODELS = ("plumb_bob", "equidistant")

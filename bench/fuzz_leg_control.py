@@ -212,7 +212,7 @@ class Fuzz:
             assert self.gap >= PARAMETERS.instrument_diameter
         self.in_step = self.in_step if self.rate > 0.0 else 0.0
         self.rate = command.opening_rate
-        if command.measure_anew:
+        if command.measure_again:
             self.track, self.track_began = self.track + 1, self.now
 
     def wait(self, seconds: float) -> None:
@@ -255,8 +255,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except AssertionError as error:
         print(f"a rule was broken: {error}")
         return 1
-    told = ", ".join(f"{number} x {action}" for action, number in counts.most_common())
-    print(f"{arguments.sequences} sequences in {time.monotonic() - began:.0f} s, no rule broken: {told}")
+    reported = ", ".join(f"{number} x {action}" for action, number in counts.most_common())
+    print(f"{arguments.sequences} sequences in {time.monotonic() - began:.0f} s, no rule broken: {reported}")
     return 0
 
 

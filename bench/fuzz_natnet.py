@@ -17,10 +17,10 @@ import time
 import traceback
 from collections.abc import Sequence
 
-from knee_gap_perception.optitrack import natnet_packets
-from knee_gap_perception.optitrack.natnet_buffer import PacketError
-from knee_gap_perception.optitrack.natnet_session import NatNetSession
-from knee_gap_simulation import natnet_server_packets as packets
+from knee_gap_perception.trackers.natnet import packets as natnet_packets
+from knee_gap_perception.trackers.natnet.buffer import PacketError
+from knee_gap_perception.trackers.natnet.session import NatNetSession
+from knee_gap_simulation.natnet import packets
 
 SERVER = ("127.0.0.1", 1510)
 VERSION = (4, 1)

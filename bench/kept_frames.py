@@ -6,33 +6,35 @@ from pathlib import Path
 
 import numpy as np
 
-from knee_gap_simulation.bench import Bench, BenchFrame
-from knee_gap_simulation.imaging import decoded
+from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
+from knee_gap_simulation.scope.imaging import decoded
 
 
-def frames_of(bench: Bench, folder: Path | None, start: int = 0, step: int = 1) -> Iterator[BenchFrame]:
+def frames_of(
+    simulator: KneeSimulator, folder: Path | None, start: int = 0, step: int = 1
+) -> Iterator[SimulatorFrame]:
     """Every `step`-th image of a bench: from the folder where all are kept there, else rendered and kept."""
     if folder is None:
-        yield from bench.frames(start, None, step)
+        yield from simulator.frames(start, None, step)
         return
-    settings = bench.settings
-    level = "".join(map(str, astuple(settings.hardness)))
+    settings = simulator.settings
+    level = "".join(map(str, astuple(settings.difficulty)))
     name = f"{level}_{settings.seed}_{settings.travel_direction}_{settings.duration_s:g}_{settings.fps:g}"
     # The exposure follows from image to image: every fourth one is not a fourth of all.
     name += f"_{start}_{step}" if (start, step) != (0, 1) else ""
     name += "_closed" if settings.gap is None else ""
     kept = folder / name
-    files = [kept / f"{index:05d}.npz" for index in range(start, bench.frame_count, step)]
+    files = [kept / f"{index:05d}.npz" for index in range(start, simulator.frame_count, step)]
     if all(file.exists() for file in files):
         yield from map(_load, files)
         return
     kept.mkdir(parents=True, exist_ok=True)
-    for file, frame in zip(files, bench.frames(start, None, step), strict=True):
+    for file, frame in zip(files, simulator.frames(start, None, step), strict=True):
         _save(file, frame)
         yield frame
 
 
-def _save(file: Path, frame: BenchFrame) -> None:
+def _save(file: Path, frame: SimulatorFrame) -> None:
     unfinished = file.with_suffix(".part")
     with unfinished.open("wb") as stream:
         np.savez_compressed(
@@ -51,10 +53,10 @@ def _save(file: Path, frame: BenchFrame) -> None:
     unfinished.rename(file)
 
 
-def _load(file: Path) -> BenchFrame:
+def _load(file: Path) -> SimulatorFrame:
     with np.load(file) as kept:
         jpeg, shape = kept["jpeg"].tobytes(), tuple(int(side) for side in kept["shape"])
-        return BenchFrame(
+        return SimulatorFrame(
             index=int(kept["index"]),
             stamp_ns=int(kept["stamp_ns"]),
             jpeg=jpeg,

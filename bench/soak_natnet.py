@@ -17,11 +17,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from knee_gap_perception.optitrack.body_source import BodyFrame, choose_body
-from knee_gap_perception.optitrack.natnet_client import NatNetClient, NatNetParameters
-from knee_gap_perception.poses import LensPose
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, TrackedScene
+from knee_gap_core.values.poses import LensPose
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.trackers.body_source import BodyFrame, choose_body
+from knee_gap_perception.trackers.natnet.client import NatNetClient, NatNetParameters
+from knee_gap_simulation.natnet.scene import CLOCK_SECONDS, TrackedScene
 
 NAMES = ("scope", "tibia", "clock")
 GROUP = "239.255.42.98"
@@ -39,7 +39,7 @@ def server_command(arguments: argparse.Namespace) -> list[str]:
         "--restart-every": 45.0,
         "--down-for": 4.0,
     }
-    module = "knee_gap_simulation.natnet_server_command"
+    module = "knee_gap_simulation.natnet.command"
     command = [sys.executable, "-m", module, "--version", arguments.version, "--rate", str(arguments.rate)]
     command += ["--command-port", str(arguments.port), "--data-port", str(arguments.port + 1)]
     if arguments.jumps:
@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--multicast", action="store_true")
     parser.add_argument("--port", type=int, default=15410)
     arguments = parser.parse_args(argv)
-    watch, end, told = Watch(), time.monotonic() + arguments.minutes * 60.0, time.monotonic()
+    watch, end, printed = Watch(), time.monotonic() + arguments.minutes * 60.0, time.monotonic()
     server = subprocess.Popen(server_command(arguments), stdout=subprocess.DEVNULL)
     try:
         parameters = NatNetParameters(command_port=arguments.port, multicast_address=GROUP)
@@ -99,8 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             while time.monotonic() < end:
                 for frame in client.poll(0.02):
                     watch.take(frame)
-                if time.monotonic() - told > 30.0:
-                    told = time.monotonic()
+                if time.monotonic() - printed > 30.0:
+                    printed = time.monotonic()
                     print(
                         f"{watch.frames} frames, {memory_mib():.0f} MiB, {client.status().words}", flush=True
                     )

@@ -19,7 +19,6 @@ setup(
     entry_points={
         "console_scripts": [
             "calibrate = knee_gap_perception.entry_points:calibrate",
-            "evaluate = knee_gap_perception.entry_points:evaluate",
             "segmentation_node = knee_gap_perception.entry_points:segmentation_node",
             "tracker_precision = knee_gap_perception.entry_points:tracker_precision",
             "tracking_node = knee_gap_perception.entry_points:tracking_node",

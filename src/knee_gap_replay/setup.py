@@ -5,7 +5,7 @@ NAME = "knee_gap_replay"
 setup(
     name=NAME,
     version="0.1.0",
-    description="Everything that reads or writes bags of knee_gap: play, record, process, check.",
+    description="Commands on bags of knee_gap: play, record, process, check, evaluate, import_motive.",
     license="Apache-2.0",
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",
@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "check = knee_gap_replay.entry_points:check",
+            "evaluate = knee_gap_replay.entry_points:evaluate",
             "import_motive = knee_gap_replay.entry_points:import_motive",
             "play = knee_gap_replay.entry_points:play",
             "process = knee_gap_replay.entry_points:process",

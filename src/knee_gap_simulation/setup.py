@@ -17,7 +17,6 @@ setup(
     ],
     zip_safe=False,
     entry_points={
-        "knee_gap.gap_truth": ["simulated = knee_gap_simulation.bag_truth:gap_masks"],
         "console_scripts": [
             "contact_sheet = knee_gap_simulation.entry_points:contact_sheet",
             "make_bag = knee_gap_simulation.entry_points:make_bag",

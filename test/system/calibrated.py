@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from knee_gap_bringup.processes import executable
-from knee_gap_perception.calibration.command import main as calibrate
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.calibration_bag import CalibrationRecording, make_calibration_bag
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_perception.calibrate.command import main as calibrate
+from knee_gap_simulation.calibration.bag import CalibrationRecording, make_calibration_bag
 
 # Of the scope; recordings are made with it by `scope_of`.
 SEED = 61

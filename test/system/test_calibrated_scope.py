@@ -18,7 +18,7 @@ from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_simulation.make_bag import Recording, make_bag
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE
 
 DOMAIN = 58
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -71,9 +71,9 @@ def test_a_gap_is_measured_with_the_file(calibration: Path, rims: Path, tmp_path
     assert comparison.valid.sum() > 30
     assert comparison.inside == 1.0
     assert comparison.median_error < 0.1e-3
-    told = messages(tmp_path / "out", "/knee_gap/scope_calibration")
+    reported = messages(tmp_path / "out", "/knee_gap/scope_calibration")
     digest = load_calibration(calibration).hash
-    assert {(message.node, message.hash) for message in told} == {
+    assert {(message.node, message.hash) for message in reported} == {
         ("segmentation_node", digest),
         ("tracking_node", digest),
     }
@@ -112,8 +112,8 @@ def test_offline_and_live_refuse_bad_settings_in_one_line(
     node = [executable("knee_gap_perception", "tracking_node"), "--ros-args", "--params-file", str(file)]
     live = subprocess.run(node, capture_output=True, text=True, check=False, timeout=60)
     assert live.returncode == 2
-    for told in (done.stderr, live.stderr):
-        lines = [line for line in told.splitlines() if line.strip()]
+    for reported in (done.stderr, live.stderr):
+        lines = [line for line in reported.splitlines() if line.strip()]
         assert len(lines) == 1
         assert words in lines[0]
 
@@ -145,13 +145,13 @@ def run_live(
         client.received["/diagnostics"].clear()
         seen: dict[str, dict[str, str]] = {}
 
-        def all_told() -> bool:
+        def all_reported() -> bool:
             for array in client.received["/diagnostics"]:
                 for status in array.status:
                     seen[status.name] = {pair.key: pair.value for pair in status.values}
             return len(seen) >= 3
 
-        client.spin_until(all_told)
+        client.spin_until(all_reported)
         return list(client.received["gap"]), seen
 
 
@@ -159,12 +159,12 @@ def test_the_live_nodes_measure_with_it_and_say_which(calibration: Path, rims: P
     def enough(client: Client) -> bool:
         return sum(gap.status == VALID for gap in client.received["gap"]) > 20
 
-    _, told = run_live(tmp_path, rims, parameters(tmp_path, calibration, calibration), enough)
+    _, reported = run_live(tmp_path, rims, parameters(tmp_path, calibration, calibration), enough)
     digest = load_calibration(calibration).hash
-    assert told["/knee_gap/segmentation_node"]["calibration"] == digest
-    assert told["/knee_gap/tracking_node"]["calibration"] == digest
+    assert reported["/knee_gap/segmentation_node"]["calibration"] == digest
+    assert reported["/knee_gap/tracking_node"]["calibration"] == digest
     for node in ("segmentation_node", "tracking_node"):
-        assert told["/knee_gap/uncertainty_node"][f"calibration of {node}"] == digest
+        assert reported["/knee_gap/uncertainty_node"][f"calibration of {node}"] == digest
 
 
 def test_live_a_wrong_size_and_two_calibrations_are_seen(
@@ -173,8 +173,8 @@ def test_live_a_wrong_size_and_two_calibrations_are_seen(
     def some(client: Client) -> bool:
         return len(client.received["gap"]) > 20
 
-    gaps, told = run_live(tmp_path, rims, parameters(tmp_path, wrong_size, calibration), some)
+    gaps, reported = run_live(tmp_path, rims, parameters(tmp_path, wrong_size, calibration), some)
     assert not any(gap.status == VALID for gap in gaps)
-    uncertainty = told["/knee_gap/uncertainty_node"]
+    uncertainty = reported["/knee_gap/uncertainty_node"]
     assert uncertainty["calibration of segmentation_node"] != uncertainty["calibration of tracking_node"]
-    assert "VALID" not in told["/knee_gap/segmentation_node"]
+    assert "VALID" not in reported["/knee_gap/segmentation_node"]

@@ -25,9 +25,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Float64, Header
 
 from knee_gap_bringup.processes import Processes, executable
-from knee_gap_msgs.msg import GapEdges, GapEstimate, ScopeCalibration, ScopeTurn
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.recording import CAMERA_INFO, IMAGE
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_msgs.msg import GapEdges, GapEstimate, ScopeCalibration, ScopeRotation
+from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
 DOMAIN = 132
 SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
@@ -51,7 +51,7 @@ TOPICS: dict[str, type] = {
     "scope_pose": PoseWithCovarianceStamped,
     "leg_body/pose": PoseStamped,
     "gap_edges": GapEdges,
-    "scope_turn": ScopeTurn,
+    "scope_rotation": ScopeRotation,
     "scope_calibration": ScopeCalibration,
     "gap": GapEstimate,
 }

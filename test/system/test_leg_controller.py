@@ -33,7 +33,7 @@ class Leg:
         self.asked = 0
         client.offer(GapEstimate, "gap", GAP_QOS)
         client.listen(TwistStamped, "leg/command")
-        client.node.create_service(Trigger, "start_anew", self._start_anew)
+        client.node.create_service(Trigger, "restart", self._start_anew)
         self._reset = client.node.create_client(Trigger, "leg_controller_node/reset")
         client.wait_matched()
         client.spin_until(self._reset.service_is_ready)

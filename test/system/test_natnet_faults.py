@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from live import Client
 
 from knee_gap_bringup.processes import Processes, executable
-from knee_gap_simulation.natnet_server_scene import TrackedScene
+from knee_gap_simulation.natnet.scene import TrackedScene
 
 DOMAIN = 64
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -69,8 +69,8 @@ class Judged:
 
     def refused(self, reason: str) -> int:
         """How many poses were refused for a reason, as last told."""
-        told = [status for array in self._client.received["/diagnostics"] for status in array.status]
-        return int({pair.key: pair.value for pair in told[-1].values}.get(f"refused: {reason}", 0))
+        reported = [status for array in self._client.received["/diagnostics"] for status in array.status]
+        return int({pair.key: pair.value for pair in reported[-1].values}.get(f"refused: {reason}", 0))
 
 
 @pytest.mark.parametrize(
@@ -94,11 +94,11 @@ def test_what_is_no_measurement_is_not_published(
 
         client.spin_until(walked, timeout=40.0)
         assert max(distance_from_truth(pose) for pose in judged.poses) < CLOSE
-        told = [one for one in judged.words() if "refused:" in one]
-        assert told
+        reported = [one for one in judged.words() if "refused:" in one]
+        assert reported
         if reason == "jump":
-            words = "has not come back" if not any(words in one for one in told) else words
-        assert any(words in one for one in told)
+            words = "has not come back" if not any(words in one for one in reported) else words
+        assert any(words in one for one in reported)
         assert processes.end("tracking_node") == 0
 
 

@@ -65,11 +65,11 @@ def test_sets_up_builds_and_measures(version: tuple[int, int], tmp_path: Path) -
         return done.stdout
 
     run("tools/setup")
-    told = run(
+    reported = run(
         "tools/env", "python", "-c", "import sys, numpy; print(*sys.version_info[:2], numpy.__version__)"
     )
-    assert told.split()[:2] == [str(version[0]), str(version[1])]
-    assert told.split()[2].startswith("2." if version >= (3, 13) else "1.26")
+    assert reported.split()[:2] == [str(version[0]), str(version[1])]
+    assert reported.split()[2].startswith("2." if version >= (3, 13) else "1.26")
     # The whole suite at once: messages, nodes, DDS, compiled kernels, bags.
     demo = run("tools/run", "knee_gap_bringup", "demo", "--rate", "0.5", "--out", str(tmp_path / "demo"))
     last = demo.splitlines()[-1]

@@ -18,9 +18,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from knee_gap_bringup.processes import Processes, executable
+from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.recording import CAMERA_INFO, IMAGE
+from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
 DOMAIN = 52
 SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
@@ -120,13 +120,13 @@ def test_every_bad_image_gets_a_status_and_good_ones_go_on(
 
     counts: dict[str, str] = {}
 
-    def told() -> bool:
+    def reported() -> bool:
         for array in client.received["/diagnostics"]:
             for status in array.status:
                 counts.update({value.key: value.value for value in status.values})
         return "UNKNOWN" in counts and "VALID" in counts
 
-    client.spin_until(told)
+    client.spin_until(reported)
     assert "Traceback" not in processes.log("segmentation_node").read_text()
 
 

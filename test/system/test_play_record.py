@@ -18,8 +18,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo
 
 from knee_gap_bringup.processes import Processes, executable
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.types import blank
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
 
 DOMAIN = 61
 IMAGE, INFO, POSE = "/image", "/info", "/pose"

@@ -13,11 +13,11 @@ pytest.importorskip("rclpy")
 
 from knee_gap_bringup.comparison import EDGES, GAP
 from knee_gap_bringup.demo import play_through_nodes
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
 from knee_gap_msgs.msg import GapEdges, GapEstimate
-from knee_gap_perception.optitrack.motive_csv import read_take
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.types import blank
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
+from knee_gap_perception.trackers.motive_csv import read_take
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -95,13 +95,13 @@ def draw_contact_sheet(bag: Path, edges: dict[int, Any], path: Path) -> None:
             if k % 6 or len(tiles) == 16:
                 continue
             picture = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_COLOR)
-            told = edges.get(stamp_of(message))
-            status = "no answer" if told is None else STATUS_NAMES[told.status]
-            if told is not None and told.status == GapEdges.STATUS_VALID:
-                for pixel, colour in ((told.pixel_0, (80, 220, 80)), (told.pixel_1, (80, 160, 255))):
+            reported = edges.get(stamp_of(message))
+            status = "no answer" if reported is None else STATUS_NAMES[reported.status]
+            if reported is not None and reported.status == GapEdges.STATUS_VALID:
+                for pixel, colour in ((reported.pixel_0, (80, 220, 80)), (reported.pixel_1, (80, 160, 255))):
                     centre = tuple(round(v) for v in pixel)
                     cv2.circle(picture, centre, 28, colour, 9, cv2.LINE_AA)
-                status += f", track {told.track_id}"
+                status += f", track {reported.track_id}"
             small = cv2.resize(picture, (480, 270), interpolation=cv2.INTER_AREA)
             cv2.putText(
                 small, status, (8, 260), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 2, cv2.LINE_AA

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 
 from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_bringup.processes import executable
-from knee_gap_replay.bag import BagReader
+from knee_gap_core.bag.bag import BagReader
 from knee_gap_uncertainty.messages import stamp_ns
 
 ROOT = Path(__file__).parents[2]
@@ -84,9 +84,9 @@ def test_offline_is_the_same_twice_to_the_bit(processed: Path, tmp_path: Path) -
 
 def test_live_keeps_the_promises(live: tuple[Path, list[str]]) -> None:
     out, lines = live
-    told = re.fullmatch(LAST_LINE, lines[-1])
-    assert told, lines[-1]
-    assert int(told[1]) >= 360
+    reported = re.fullmatch(LAST_LINE, lines[-1])
+    assert reported, lines[-1]
+    assert int(reported[1]) >= 360
     check_promises(compare(SAMPLE, out / "gap.mcap"))
     assert (out / "gap.png").stat().st_size > 10_000
 

@@ -17,10 +17,10 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from knee_gap_bringup.processes import Processes, executable
+from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_msgs.srv import ChoosePoint
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.recording import CAMERA_INFO, IMAGE
+from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
 DOMAIN = 57
 SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
@@ -94,7 +94,7 @@ class Feed:
         self.client.spin_until(future.done)
         return future.result()
 
-    def told(self, words: str) -> bool:
+    def reported(self, words: str) -> bool:
         """Whether the latest diagnostics say a word."""
         texts = [
             status.message for array in self.client.received["/diagnostics"][-1:] for status in array.status
@@ -189,8 +189,8 @@ def test_a_point_is_chosen_and_a_track_ended_by_service(feed: Feed, frames: list
     assert (taken.accepted, taken.reason) == (True, "")
     chosen = feed.send(frames[2])
     assert (chosen.status, chosen.track_id) == (VALID, first.track_id + 1)
-    anew = feed.call(Trigger, "start_anew", Trigger.Request())
-    assert anew.success
+    again = feed.call(Trigger, "restart", Trigger.Request())
+    assert again.success
     assert feed.send(frames[3]).track_id == first.track_id + 2
     click = PointStamped()
     click.point.x, click.point.y = (float(value) for value in middle)
@@ -237,7 +237,7 @@ def test_a_picture_that_shows_no_points_is_told(
     edges = feed.send(np.ascontiguousarray(picture), encoding)
     if name in ("closed joint", "all glare"):
         # Points that were followed are hidden at first; then a gap is looked for.
-        feed.call(Trigger, "start_anew", Trigger.Request())
+        feed.call(Trigger, "restart", Trigger.Request())
         edges = feed.send(noisy(picture, 1), encoding)
     assert edges.status in statuses
     assert np.isnan([edges.bearing_0.x, edges.pixel_1[1], edges.angular_error, edges.covariance_0[0]]).all()
@@ -267,7 +267,7 @@ def test_an_unusual_picture_gives_points_all_the_same(
         "rgb": (cv2.cvtColor(good, cv2.COLOR_BGR2RGB), "rgb8"),
         "bgra": (cv2.cvtColor(good, cv2.COLOR_BGR2BGRA), "bgra8"),
     }[name]
-    feed.call(Trigger, "start_anew", Trigger.Request())
+    feed.call(Trigger, "restart", Trigger.Request())
     edges = feed.send(np.ascontiguousarray(picture), encoding)
     for turn in range(30):
         # Where the field of view has moved it is found anew within half a second.
@@ -288,7 +288,7 @@ def test_frozen_video_and_a_new_resolution(feed: Feed, frames: list[np.ndarray])
     assert set(statuses[3:]) == {UNKNOWN}
     feed.client.received["/diagnostics"].clear()
     feed.client.spin_until(lambda: bool(feed.client.received["/diagnostics"]))
-    assert feed.told("frozen")
+    assert feed.reported("frozen")
     before = feed.send(frames[8])
     assert before.status == VALID
     large = cv2.resize(frames[9], (1920, 1080))

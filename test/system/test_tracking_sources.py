@@ -60,9 +60,9 @@ def test_poses_come_from_motive_and_come_back_after_a_restart(version: str, tmp_
         before = len(poses)
         client.spin(1.0)
         assert len(poses) == before
-        told = [status for array in client.received["/diagnostics"] for status in array.status]
-        assert told[-1].level != b"\x00"
-        assert told[-1].message
+        reported = [status for array in client.received["/diagnostics"] for status in array.status]
+        assert reported[-1].level != b"\x00"
+        assert reported[-1].message
 
         processes.start("server_again", server)
         client.spin_until(lambda: len(poses) > before + 60, timeout=40.0)
@@ -96,7 +96,7 @@ def test_leg_as_reference(tmp_path: Path) -> None:
         assert [m.pose.pose.position.x for m in poses] == pytest.approx([0.1] * len(poses), abs=1e-4)
 
 
-def told_words(tmp_path: Path, server: list[str], settings: dict[str, str], words: str) -> str:
+def reported_words(tmp_path: Path, server: list[str], settings: dict[str, str], words: str) -> str:
     """What diagnostics say once they hold `words`, with a server and settings of tracking_node."""
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         processes.start("server", [executable("knee_gap_simulation", "natnet_server"), *server])
@@ -109,8 +109,10 @@ def told_words(tmp_path: Path, server: list[str], settings: dict[str, str], word
         processes.wait_ready(["tracking_node"], 60.0)
 
         def last() -> str:
-            told = [status.message for array in client.received["/diagnostics"] for status in array.status]
-            return told[-1] if told else ""
+            reported = [
+                status.message for array in client.received["/diagnostics"] for status in array.status
+            ]
+            return reported[-1] if reported else ""
 
         client.spin_until(lambda: words in last(), timeout=30.0)
         assert not client.received["scope_pose"]
@@ -121,22 +123,26 @@ def told_words(tmp_path: Path, server: list[str], settings: dict[str, str], word
 def test_a_body_that_motive_does_not_have_is_told_with_those_it_has(tmp_path: Path) -> None:
     port = str(free_port())
     server = ["--command-port", port, "--body", "probe", "--body", "tibia"]
-    told = told_words(tmp_path, server, {"body": "scope", "command_port": port}, "no rigid body 'scope'")
-    assert "'probe' (id 1), 'tibia' (id 2)" in told
+    reported = reported_words(
+        tmp_path, server, {"body": "scope", "command_port": port}, "no rigid body 'scope'"
+    )
+    assert "'probe' (id 1), 'tibia' (id 2)" in reported
 
 
 def test_silence_is_told_with_its_likely_causes(tmp_path: Path) -> None:
     settings = {"body": "scope", "command_port": str(free_port())}
-    told = told_words(tmp_path, ["--command-port", str(free_port())], settings, "no answer from 127.0.0.1")
-    assert "likely causes: Motive does not run or does not stream" in told
+    reported = reported_words(
+        tmp_path, ["--command-port", str(free_port())], settings, "no answer from 127.0.0.1"
+    )
+    assert "likely causes: Motive does not run or does not stream" in reported
 
 
 def test_a_server_that_shows_no_frames_is_told_from_one_that_is_not_there(tmp_path: Path) -> None:
     port = str(free_port())
     server = ["--command-port", port, "--lose", "1.0"]
-    told = told_words(tmp_path, server, {"body": "scope", "command_port": port}, "but no data for")
-    assert told.startswith("connected to Motive")
-    assert "likely causes" in told
+    reported = reported_words(tmp_path, server, {"body": "scope", "command_port": port}, "but no data for")
+    assert reported.startswith("connected to Motive")
+    assert "likely causes" in reported
 
 
 def test_of_two_servers_one_is_listened_to(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from knee_gap_bringup.processes import Processes, executable
 from knee_gap_msgs.msg import GapEstimate, ScopeNotch
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_simulation.make_bag import Recording, make_bag
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE
 
 DOMAIN = 63
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -48,28 +48,28 @@ def parameters(folder: Path, calibration: Path, *by_notch: bool) -> Path:
     lines = []
     for node, notch in zip(("segmentation_node", "tracking_node"), by_notch, strict=True):
         lines += [f"/**/{node}:", "  ros__parameters:", f'    calibration_file: "{calibration}"']
-        lines += [f"    scope_turn_notch: {str(notch).lower()}"]
+        lines += [f"    scope_rotation_notch: {str(notch).lower()}"]
     path = folder / "parameters.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
-def test_the_gap_is_right_while_the_scope_turns(calibration: Path, turned: Path, tmp_path: Path) -> None:
+def test_the_gap_is_right_while_the_scope_rotations(calibration: Path, turned: Path, tmp_path: Path) -> None:
     done = process(turned, tmp_path / "out", parameters(tmp_path, calibration, True, True))
     assert done.returncode == 0, done.stderr
     comparison = compare(turned, tmp_path / "out")
     assert comparison.valid.sum() > 40
     assert comparison.inside == 1.0
     assert comparison.median_error < 0.15e-3
-    sights = messages(tmp_path / "out", "/knee_gap/scope_notch")
-    seen = {(s.header.stamp.sec, s.header.stamp.nanosec): s.angle for s in sights if s.seen}
+    observations = messages(tmp_path / "out", "/knee_gap/scope_notch")
+    seen = {(s.header.stamp.sec, s.header.stamp.nanosec): s.angle for s in observations if s.seen}
     assert np.ptp(np.unwrap(list(seen.values()))) > np.radians(24)
     poses = messages(tmp_path / "out", "/knee_gap/scope_pose")
     # A pose at each image whose notch was seen, and at no other time.
     assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in poses} == set(seen)
     turns = {
         (t.header.stamp.sec, t.header.stamp.nanosec): t.turn
-        for t in messages(tmp_path / "out", "/knee_gap/scope_turn")
+        for t in messages(tmp_path / "out", "/knee_gap/scope_rotation")
     }
     assert set(turns) == set(seen)
     assert np.ptp([np.angle(np.exp(1j * (turns[stamp] - seen[stamp]))) for stamp in seen]) < 1e-9
@@ -85,7 +85,7 @@ def test_a_turn_that_is_not_told_of_makes_it_wrong(calibration: Path, turned: Pa
 def test_offline_the_two_nodes_must_agree(calibration: Path, turned: Path, tmp_path: Path) -> None:
     done = process(turned, tmp_path / "out", parameters(tmp_path, calibration, True, False))
     assert done.returncode == 1
-    assert "scope_turn_notch must be the same" in done.stderr
+    assert "scope_rotation_notch must be the same" in done.stderr
 
 
 def live(folder: Path, processes: Processes, bag: Path, file: Path) -> None:
@@ -146,13 +146,13 @@ def test_live_without_word_of_the_notch_nothing_is_valid(
         live(tmp_path, processes, turned, file)
         words: set[str] = set()
 
-        def told() -> bool:
+        def reported() -> bool:
             for array in client.received["/diagnostics"]:
                 words.update(s.message for s in array.status if s.name == "/knee_gap/tracking_node")
             return (
                 any("nobody tells of the notch" in one for one in words) and len(client.received["gap"]) > 20
             )
 
-        client.spin_until(told, timeout=90.0)
+        client.spin_until(reported, timeout=90.0)
         assert not client.received["scope_pose"]
         assert all(gap.status != VALID and np.isnan(gap.gap) for gap in client.received["gap"])

@@ -15,18 +15,24 @@ MODULES = sorted(path for package in PACKAGES for path in (SOURCES / package / p
 
 # What each package may import of the others.
 MAY_IMPORT = {
-    "knee_gap_node": set(),
-    "knee_gap_perception": {"knee_gap_msgs", "knee_gap_node"},
-    "knee_gap_uncertainty": {"knee_gap_msgs", "knee_gap_node"},
-    "knee_gap_replay": {"knee_gap_msgs", "knee_gap_node", "knee_gap_perception", "knee_gap_uncertainty"},
-    "knee_gap_simulation": {"knee_gap_msgs", "knee_gap_node", "knee_gap_replay"},
-    "knee_gap_bringup": {
+    "knee_gap_core": {"knee_gap_msgs"},
+    "knee_gap_perception": {"knee_gap_msgs", "knee_gap_core"},
+    "knee_gap_uncertainty": {"knee_gap_msgs", "knee_gap_core"},
+    "knee_gap_simulation": {"knee_gap_msgs", "knee_gap_core"},
+    "knee_gap_replay": {
         "knee_gap_msgs",
-        "knee_gap_node",
+        "knee_gap_core",
         "knee_gap_perception",
         "knee_gap_uncertainty",
-        "knee_gap_replay",
         "knee_gap_simulation",
+    },
+    "knee_gap_bringup": {
+        "knee_gap_msgs",
+        "knee_gap_core",
+        "knee_gap_perception",
+        "knee_gap_uncertainty",
+        "knee_gap_simulation",
+        "knee_gap_replay",
     },
 }
 

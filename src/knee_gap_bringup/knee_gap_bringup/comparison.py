@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.recording import LENS_POSE_TRUE
-from knee_gap_simulation.rigid import FloatArray, from_parts
-from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
-from knee_gap_uncertainty.gap_estimate import GapStatus
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
+from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.rigid import from_parts
 from knee_gap_uncertainty.messages import stamp_ns
 
 Floats = npt.NDArray[np.float64]
@@ -145,7 +146,7 @@ class _Truths:
     def __init__(self, recording: Path, output: Path) -> None:
         with BagReader(recording) as bag:
             self._scene = scene_from_metadata(bag.metadata)
-            self._poses: dict[int, FloatArray] = {}
+            self._poses: dict[int, Array] = {}
             for entry in bag.messages([LENS_POSE_TRUE]):
                 pose = bag.deserialize(entry)
                 self._poses[stamp_ns(pose.header)] = _matrix(pose.pose)
@@ -178,7 +179,7 @@ class _Truths:
         return self._gaps[stamp]
 
 
-def true_gap(scene: SceneTruth, T_world_lens: FloatArray, edges: Any) -> float:
+def true_gap(scene: SceneTruth, T_world_lens: Array, edges: Any) -> float:
     """True instrument gap [m] at the section of a GapEdges message, seen from a true lens pose (4, 4).
 
     Where it does not give both edges, the section leads through the middle between its tracked points. NaN
@@ -190,13 +191,13 @@ def true_gap(scene: SceneTruth, T_world_lens: FloatArray, edges: Any) -> float:
     return scene.reported_gap(T_world_lens, bearings, np.array([edges.pixel_0, edges.pixel_1]))
 
 
-def true_point_distance(scene: SceneTruth, T_world_lens: FloatArray, edges: Any) -> float:
+def true_point_distance(scene: SceneTruth, T_world_lens: Array, edges: Any) -> float:
     """Distance [m] of the surface points behind the pixels of a GapEdges message, from a true lens pose."""
     points = scene.surface_points(T_world_lens, np.array([edges.pixel_0, edges.pixel_1]))
     return float(np.linalg.norm(points[1] - points[0]))
 
 
-def _matrix(pose: Any) -> FloatArray:
+def _matrix(pose: Any) -> Array:
     """A geometry_msgs/Pose as (4, 4)."""
     p, q = pose.position, pose.orientation
     return from_parts(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z])

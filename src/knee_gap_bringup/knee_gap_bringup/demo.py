@@ -13,11 +13,11 @@ from knee_gap_bringup.gap_plot import write_gap_plot
 from knee_gap_bringup.launch_plan import DRAIN, NODES
 from knee_gap_bringup.processes import Processes, StartError, executable
 from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
-from knee_gap_node.command_line import Parser, finite
-from knee_gap_replay.bag import BagReader
-from knee_gap_replay.errors import BagError
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.node.arguments import Parser, finite
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
 NAMESPACE = "/knee_gap"
 RECORDED = (

@@ -1,6 +1,6 @@
 """Entry points of the package's executables, which can be stopped while their modules are imported."""
 
-from knee_gap_node.entry import entry
+from knee_gap_core.node.entry import entry
 
 demo = entry("knee_gap_bringup.demo")
 leg_controller_node = entry("knee_gap_bringup.leg_controller_node", node=True)

@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
-from knee_gap_node.bag_paths import missing_bag
+from knee_gap_core.bag.bag_paths import missing_bag
 
 NODES = {
     "segmentation_node": "knee_gap_perception",
@@ -23,7 +23,7 @@ INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
 OUTPUTS = (
     "gap_edges",
     "scope_pose",
-    "scope_turn",
+    "scope_rotation",
     "scope_notch",
     "scope_calibration",
     "gap",

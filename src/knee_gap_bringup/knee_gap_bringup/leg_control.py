@@ -35,12 +35,12 @@ class Action(StrEnum):
 
 
 class Command(NamedTuple):
-    """Rate at which the joint should open [m/s] and why; `measure_anew`: the track shall end now."""
+    """Rate at which the joint should open [m/s] and why; `measure_again`: the track shall end now."""
 
     action: Action
     opening_rate: float
     reason: str
-    measure_anew: bool = False
+    measure_again: bool = False
 
 
 class Estimate(NamedTuple):
@@ -298,7 +298,7 @@ class LegControl:
         if now < self._rests_from:
             return hold("the leg comes to rest")
         self._at_rest_since, self._rests_from = self._rests_from, None
-        return hold("the joint has moved: the gap is measured again")._replace(measure_anew=True)
+        return hold("the joint has moved: the gap is measured again")._replace(measure_again=True)
 
     def _note_track(self, estimate: Estimate, now: float) -> None:
         """Remember when the first image of a track was taken, as far as it was heard of."""

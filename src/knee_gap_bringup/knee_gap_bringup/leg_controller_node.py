@@ -11,8 +11,8 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegControl, LegParameters, hold
+from knee_gap_core.node.base_node import RESULT_QOS, BaseNode, run
 from knee_gap_msgs.msg import GapEstimate
-from knee_gap_node.base_node import RESULT_QOS, BaseNode, run
 
 # The frame of the command: its x axis is the direction in which the joint opens.
 LEG_FRAME = "leg"
@@ -30,7 +30,7 @@ class LegControllerNode(BaseNode):
         self._control = LegControl(self.declare(LegParameters))
         self.refuse_unknown_parameters()
         self._command = hold("no estimate received yet")
-        self._measure_anew = self.create_client(Trigger, "start_anew")
+        self._measure_again = self.create_client(Trigger, "restart")
         self._rate = self.create_publisher(TwistStamped, "leg/command", RESULT_QOS)
         self.create_service(Trigger, "~/reset", self.on_reset)
         qos = QoSProfile(
@@ -94,12 +94,12 @@ class LegControllerNode(BaseNode):
             command = decide()
         except Exception as error:  # the leg is held whatever went wrong
             command = self._control.on_fault(f"the controller failed: {error!r}", time.monotonic())
-        if command.measure_anew:
+        if command.measure_again:
             # Without an answer the leg is held: the old track is not used any more.
-            self._measure_anew.call_async(Trigger.Request())
+            self._measure_again.call_async(Trigger.Request())
         self.log(command)
         # A request is made once, however often the command is repeated.
-        self._command = command._replace(measure_anew=False)
+        self._command = command._replace(measure_again=False)
         message = TwistStamped()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = LEG_FRAME

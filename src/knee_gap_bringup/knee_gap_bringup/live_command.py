@@ -9,7 +9,7 @@ from ament_index_python.packages import get_package_share_directory
 
 from knee_gap_bringup.launch_plan import RESPAWN_DELAY, live_plan, live_problem
 from knee_gap_bringup.supervisor import supervise
-from knee_gap_replay.command_line import Parser
+from knee_gap_core.node.command_line import Parser
 
 
 def tell(line: str) -> None:

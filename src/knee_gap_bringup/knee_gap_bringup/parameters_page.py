@@ -7,7 +7,7 @@ from math import isnan
 from typing import Any
 
 from knee_gap_bringup.leg_control import LegParameters
-from knee_gap_perception.segmentation_parameters import TransportParameters
+from knee_gap_perception.edge_tracking.parameters import TransportParameters
 from knee_gap_replay.pipeline import PARAMETERS
 
 NODES: dict[str, tuple[type, ...]] = {

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from knee_gap_bringup.launch_plan import replay_plan, replay_problem
 from knee_gap_bringup.supervisor import supervise
-from knee_gap_replay.command_line import Parser
+from knee_gap_core.node.command_line import Parser
 
 
 def tell(line: str) -> None:

@@ -15,21 +15,21 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.bag.errors import BagError
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     Clock,
     LensOnBody,
     save_calibration,
 )
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.scope_turn import Mount
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.camera.medium import medium_of
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import medium_of
-from knee_gap_replay.bag import BagReader
-from knee_gap_replay.errors import BagError
+from knee_gap_perception.scope_rotation.shaft_axis import Mount
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.media import calibrated
-from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.scope.media import calibrated
 
 CALIBRATION_FILE = "calibration.yaml"
 # Standard errors; of the lens RMS lengths [rad], [m]; of fx, fy, cx, cy [px] and four of the distortion.

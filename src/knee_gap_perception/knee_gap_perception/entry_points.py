@@ -1,9 +1,8 @@
 """Entry points of the package's executables, which can be stopped while their modules are imported."""
 
-from knee_gap_node.entry import entry
+from knee_gap_core.node.entry import entry
 
-calibrate = entry("knee_gap_perception.calibration.command")
-evaluate = entry("knee_gap_perception.evaluate")
+calibrate = entry("knee_gap_perception.calibrate.command")
 segmentation_node = entry("knee_gap_perception.segmentation_node", node=True)
-tracker_precision = entry("knee_gap_perception.tracker_precision_command")
+tracker_precision = entry("knee_gap_perception.tracker_precision.command")
 tracking_node = entry("knee_gap_perception.tracking_node", node=True)

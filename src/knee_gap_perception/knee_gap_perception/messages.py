@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.edges import GapEdges, SectionEdges
+from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edges import GapEdges, SectionEdges
+from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.poses import FARTHEST, LensPose, is_unit
-
-Image = npt.NDArray[np.uint8]
 
 # Channels of each accepted encoding and what makes it blue, green, red.
 ENCODINGS: dict[str, tuple[int, int | None]] = {

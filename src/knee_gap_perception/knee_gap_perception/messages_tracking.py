@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
+from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.calibration.calibration_file import Calibration
-from knee_gap_perception.camera_errors import pupil_shift
-from knee_gap_perception.medium import Medium
+from knee_gap_perception.camera.camera_errors import pupil_shift
+from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.messages import stamp_ns
-from knee_gap_perception.notch_follower import NotchSight
-from knee_gap_perception.poses import BodyPose, LensPose
+from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
 
-NOT_TOLD = "the notch is not seen, and no reason was told"
+NO_REASON = "the notch is not seen, and no reason was told"
 
 
 def body_pose_from_message(message: Any, name: str = "") -> BodyPose:
@@ -53,7 +53,7 @@ def fill_scope_calibration(
     node: str,
     calibration: Calibration | None,
     *,
-    turn_followed: bool = False,
+    rotation_followed: bool = False,
     medium: Medium | None = None,
 ) -> Any:
     """Set every field of a knee_gap_msgs/ScopeCalibration; returns the message.
@@ -63,7 +63,7 @@ def fill_scope_calibration(
     along its view.
     """
     message.node, message.hash = node, calibration.hash if calibration else ""
-    message.turn_followed = turn_followed
+    message.rotation_followed = rotation_followed
     covariance = np.full((6, 6), np.nan)
     message.time_offset = message.time_offset_error = float("nan")
     if calibration is not None:
@@ -79,31 +79,31 @@ def fill_scope_calibration(
     return message
 
 
-def fill_scope_turn(message: Any, lens: LensPose) -> Any:
-    """Set every field of a knee_gap_msgs/ScopeTurn; returns the message."""
+def fill_scope_rotation(message: Any, lens: LensPose) -> Any:
+    """Set every field of a knee_gap_msgs/ScopeRotation; returns the message."""
     _fill_header(message.header, lens)
     message.header.frame_id = lens.child_frame_id
-    message.turn = float(lens.scope_turn)
+    message.turn = float(lens.scope_rotation)
     return message
 
 
-def fill_scope_notch(message: Any, sight: NotchSight, frame_id: str) -> Any:
+def fill_scope_notch(message: Any, observation: NotchObservation, frame_id: str) -> Any:
     """Set every field of a knee_gap_msgs/ScopeNotch; returns the message."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sight.stamp_ns, 1_000_000_000)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(observation.stamp_ns, 1_000_000_000)
     message.header.frame_id = frame_id
-    message.seen, message.reason = sight.seen, sight.reason
-    message.angle, message.angle_error = float(sight.angle), float(sight.angle_error)
+    message.seen, message.reason = observation.seen, observation.reason
+    message.angle, message.angle_error = float(observation.angle), float(observation.angle_error)
     return message
 
 
-def notch_from_message(message: Any) -> NotchSight:
+def notch_from_message(message: Any) -> NotchObservation:
     """The sight of a knee_gap_msgs/ScopeNotch; numbers that are none are no sight, whatever it says."""
     stamp = stamp_ns(message.header)
-    reason = "" if message.seen else str(message.reason) or NOT_TOLD
+    reason = "" if message.seen else str(message.reason) or NO_REASON
     angle, error = float(message.angle), float(message.angle_error)
     if not reason and not (isfinite(angle) and isfinite(error) and error >= 0.0):
         reason = f"the notch's angle must be finite, with its error, not {angle:g} and {error:g}"
-    return NotchSight(stamp, nan if reason else angle, nan if reason else error, reason)
+    return NotchObservation(stamp, nan if reason else angle, nan if reason else error, reason)
 
 
 def _fill_header(header: Any, lens: LensPose) -> None:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from knee_gap_node.parameter_rules import broken_rule
+from knee_gap_core.node.parameter_rules import broken_rule
 from knee_gap_perception.errors import PerceptionError
 
 

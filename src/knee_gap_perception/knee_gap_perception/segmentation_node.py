@@ -10,24 +10,24 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
+from knee_gap_core.node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, BaseNode, run
+from knee_gap_core.node.errors import ConfigurationError
+from knee_gap_core.node.seam import Fault
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_core.values.edges import GapEdges as Edges
 from knee_gap_msgs.msg import GapEdges, GapSection, ScopeCalibration, ScopeNotch
 from knee_gap_msgs.srv import ChoosePoint
-from knee_gap_node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, BaseNode, run
-from knee_gap_node.errors import ConfigurationError
-from knee_gap_node.seam import Fault
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
-from knee_gap_perception.edge_parameters import EdgeParameters
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import EdgeStatus
-from knee_gap_perception.edges import GapEdges as Edges
-from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
-from knee_gap_perception.segmentation_parameters import (
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.parameters import (
     CameraInfoParameters,
     PoseParameters,
     TransportParameters,
 )
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
+from knee_gap_perception.messages import fill_gap_edges
+from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
 from knee_gap_perception.warm_up import warm_up
 
 
@@ -46,7 +46,7 @@ class SegmentationNode(BaseNode):
                 edges,
                 poses,
                 calibration.load(),
-                by_notch=calibration.scope_turn_notch,
+                by_notch=calibration.scope_rotation_notch,
                 first_track_id=unused_track_id(),
                 medium=calibration.used_in,
                 camera_info_medium=camera_info.calibrated_in,
@@ -58,7 +58,7 @@ class SegmentationNode(BaseNode):
         self._dropped = 0
         self._sequence: int | None = None
         self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)
-        if calibration.scope_turn_notch:
+        if calibration.scope_rotation_notch:
             self._notch = self.create_publisher(ScopeNotch, "scope_notch", RESULT_QOS)
         self._mask = self.create_publisher(Image, "gap_mask", IMAGE_QOS)
         self._overlay = self.create_publisher(Image, "~/overlay", IMAGE_QOS)
@@ -69,7 +69,7 @@ class SegmentationNode(BaseNode):
         self.create_subscription(CameraInfo, "camera_info", self._stream.on_camera_info, IMAGE_QOS)
         self.create_subscription(PointStamped, "clicked_point", self.on_click, RESULT_QOS)
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
-        self.create_service(Trigger, "start_anew", self.on_start_anew)
+        self.create_service(Trigger, "restart", self.on_restart)
         self._poses = self.create_subscription(
             # Reliable: lost on the way, poses would leave a gap that ends the track.
             PoseWithCovarianceStamped,
@@ -79,8 +79,8 @@ class SegmentationNode(BaseNode):
         )
         self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
-        told = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
-        self._calibration.publish(told)
+        reported = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
+        self._calibration.publish(reported)
         # Runs while an image waits for its pose, so that it does not wait longer than it may.
         self._patience = self.create_timer(max(poses.max_pose_wait, 0.001), self.publish_ready)
         self._patience.cancel()
@@ -88,9 +88,9 @@ class SegmentationNode(BaseNode):
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
         """Take an image; it is looked at now, or once the pose that follows it is there."""
         self.count_dropped(info.get("publication_sequence_number"))
-        if (sight := self._stream.on_image(message, self.now_ns())) is not None:
+        if (observation := self._stream.on_image(message, self.now_ns())) is not None:
             # At once: the pose that the image waits for rests on it.
-            self._notch.publish(fill_scope_notch(ScopeNotch(), sight, message.header.frame_id))
+            self._notch.publish(fill_scope_notch(ScopeNotch(), observation, message.header.frame_id))
         self.publish_ready()
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
@@ -155,9 +155,9 @@ class SegmentationNode(BaseNode):
         answer.accepted = not answer.reason
         return answer
 
-    def on_start_anew(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+    def on_restart(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """End the track; the next image that shows a gap begins a new one."""
-        self._stream.detector.start_anew()
+        self._stream.detector.restart()
         answer.success, answer.message = True, "the next image that shows a gap begins a new track"
         return answer
 

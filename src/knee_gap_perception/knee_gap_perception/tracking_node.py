@@ -7,25 +7,25 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
-from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch, ScopeTurn
-from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
-from knee_gap_node.errors import ConfigurationError
-from knee_gap_node.seam import Fault
+from knee_gap_core.node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_core.node.errors import ConfigurationError
+from knee_gap_core.node.seam import Fault
+from knee_gap_core.values.poses import LensPose
+from knee_gap_msgs.msg import ScopeCalibration, ScopeNotch, ScopeRotation
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
     fill_scope_calibration,
-    fill_scope_turn,
+    fill_scope_rotation,
     notch_from_message,
 )
-from knee_gap_perception.optitrack.natnet_client import NatNetParameters
-from knee_gap_perception.optitrack.pose_topic import PoseTopics
-from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
-from knee_gap_perception.optitrack.scope_feed import SCOPE, ScopeFeed, SourceParameters
-from knee_gap_perception.pose_validity import Refusal, ValidityParameters
-from knee_gap_perception.poses import LensPose
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.trackers.natnet.client import NatNetParameters
+from knee_gap_perception.trackers.pose_topic import PoseTopics
+from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
+from knee_gap_perception.trackers.scope_feed import SCOPE, ScopeFeed, SourceParameters
 
 # After so many diagnostics, one a second, a source that still gives nothing is told in the log as well.
 DIAGNOSTICS_TO_LOG = 5
@@ -50,26 +50,28 @@ class TrackingNode(BaseNode):
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
             self._tracker = ScopeTracker(
-                parameters, validity, calibration.load(), by_notch=calibration.scope_turn_notch
+                parameters, validity, calibration.load(), by_notch=calibration.scope_rotation_notch
             )
-            others = tuple(name for name in (parameters.reference_body, parameters.scope_turn_body) if name)
+            others = tuple(
+                name for name in (parameters.reference_body, parameters.scope_rotation_body) if name
+            )
             self._feed = ScopeFeed(source, natnet, other_bodies=others, ros_now=self.now_ns)
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
-        if self._tracker.follows_turn:
-            self._scope_turn = self.create_publisher(ScopeTurn, "scope_turn", RESULT_QOS)
+        if self._tracker.follows_rotation:
+            self._scope_rotation = self.create_publisher(ScopeRotation, "scope_rotation", RESULT_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
-        told = fill_scope_calibration(
+        reported = fill_scope_calibration(
             ScopeCalibration(),
             "tracking_node",
             self._tracker.calibration,
-            turn_followed=self._tracker.follows_turn,
+            rotation_followed=self._tracker.follows_rotation,
             medium=calibration.used_in,
         )
-        self._calibration.publish(told)
+        self._calibration.publish(reported)
         # Images and what Motive sends come in threads of their own.
         self._one_at_a_time = threading.Lock()
-        if calibration.scope_turn_notch:
+        if calibration.scope_rotation_notch:
             self.create_subscription(ScopeNotch, "scope_notch", self.on_notch, RESULT_QOS)
         self._ended = threading.Event()
         self._receiver: threading.Thread | None = None
@@ -90,7 +92,7 @@ class TrackingNode(BaseNode):
         topics = {
             SCOPE: "scope_body/pose",
             parameters.reference_body: "reference_body/pose",
-            parameters.scope_turn_body: "scope_turn_body/pose",
+            parameters.scope_rotation_body: "scope_rotation_body/pose",
         }
         for name, topic in topics.items():
             if not name:
@@ -147,8 +149,8 @@ class TrackingNode(BaseNode):
         """Publish poses of the lens, and log why there are none."""
         for lens in lenses:
             if isinstance(lens, LensPose):
-                if self._tracker.follows_turn:
-                    self._scope_turn.publish(fill_scope_turn(ScopeTurn(), lens))
+                if self._tracker.follows_rotation:
+                    self._scope_rotation.publish(fill_scope_rotation(ScopeRotation(), lens))
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
                 self._refused, self._why_refused = self._refused + 1, lens.detail
@@ -185,7 +187,7 @@ class TrackingNode(BaseNode):
             **source.values,
             **refused,
         }
-        if self._tracker.follows_turn:
+        if self._tracker.follows_rotation:
             counts["turn of the scope [rad]"] = self._tracker.turn
         return source.ok and accepted > 0, words, counts
 

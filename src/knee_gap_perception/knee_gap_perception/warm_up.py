@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.camera import FisheyeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeStatus
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import FisheyeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 
 HEIGHT, WIDTH = 720, 1280
 RADIUS = 350
@@ -29,7 +29,7 @@ def picture(shift: int) -> npt.NDArray[np.uint8]:
 def warm_up() -> EdgeStatus:
     """Find a gap and follow its edges through a few pictures; status of the last, VALID if all was run."""
     camera = FisheyeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (0.0, 0.0, 0.0, 0.0))
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     status = EdgeStatus.UNKNOWN
     for k in range(4):
         status = detector.process(1 + 16_666_667 * k, picture(2 * k), camera).status

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_replay.bag import BagMessage, BagReader
-from knee_gap_replay.errors import BagError
+from knee_gap_core.bag.bag import BagMessage, BagReader
+from knee_gap_core.bag.errors import BagError
 from knee_gap_replay.topics import InputTopics
 
 _SECOND_NS = 1e9

@@ -4,9 +4,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from knee_gap_replay.bag import BagReader
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.node.command_line import Parser, run
 from knee_gap_replay.bag_check import TopicCheck, check_topics, reasons_against
-from knee_gap_replay.command_line import Parser, run
 from knee_gap_replay.topics import add_topic_arguments, topics_from
 
 

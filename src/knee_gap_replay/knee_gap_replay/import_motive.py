@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.node.command_line import Parser, finite, not_negative, run
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.motive_csv import Take, TakeBody, read_take
-from knee_gap_perception.optitrack.up_axis import UP_AXES
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.command_line import Parser, finite, not_negative, run
-from knee_gap_replay.errors import BagError
+from knee_gap_perception.trackers.motive_csv import Take, TakeBody, read_take
+from knee_gap_perception.trackers.up_axis import UP_AXES
 from knee_gap_replay.topics import namespace_from
-from knee_gap_replay.types import blank
 
 NANOSECONDS = 1_000_000_000
 # Stamps of ROS count seconds in 31 bits.
@@ -106,10 +106,10 @@ def _run(arguments: argparse.Namespace) -> int:
         print(
             f"import_motive: the file says {take.exported_count} frames and holds {frames}", file=sys.stderr
         )
-    told = ", ".join(
+    summary = ", ".join(
         f"{count} of '{body.name}' on {topic}" for count, (topic, body) in zip(counts, bodies, strict=True)
     )
-    print(f"import_motive: {frames} frames, poses: {told}, in {arguments.out}")
+    print(f"import_motive: {frames} frames, poses: {summary}, in {arguments.out}")
     return 0
 
 

@@ -11,42 +11,42 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_node.seam import Fault, Seam
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.bag.qos import QosName
+from knee_gap_core.node.parameters_file import ParametersFile
+from knee_gap_core.node.seam import Fault, Seam
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.calibration.in_use import CalibrationParameters
-from knee_gap_perception.edge_parameters import EdgeParameters
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import GapEdges
+from knee_gap_perception.camera.medium import Medium
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.parameters import CameraInfoParameters, PoseParameters
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import Medium
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
     fill_scope_calibration,
     fill_scope_notch,
-    fill_scope_turn,
+    fill_scope_rotation,
     notch_from_message,
 )
-from knee_gap_perception.notch_follower import NotchSight
-from knee_gap_perception.optitrack.body_source import choose_body
-from knee_gap_perception.optitrack.natnet_client import NatNetParameters
-from knee_gap_perception.optitrack.pose_topic import PoseTopics
-from knee_gap_perception.optitrack.scope_feed import SCOPE, SourceParameters
-from knee_gap_perception.pose_validity import Refusal, ValidityParameters
-from knee_gap_perception.poses import LensPose
-from knee_gap_perception.segmentation_parameters import CameraInfoParameters, PoseParameters
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_replay.errors import BagError
-from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
+from knee_gap_perception.trackers.body_source import choose_body
+from knee_gap_perception.trackers.natnet.client import NatNetParameters
+from knee_gap_perception.trackers.pose_topic import PoseTopics
+from knee_gap_perception.trackers.scope_feed import SCOPE, SourceParameters
 from knee_gap_replay.processing import Output
-from knee_gap_replay.qos import QosName
 from knee_gap_replay.topics import InputTopics
-from knee_gap_replay.types import blank
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.delays import NANOSECONDS
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
-from knee_gap_uncertainty.motion_advice import AdviceParameters
+from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 
 _LOG = logging.getLogger(__name__)
 _NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
@@ -84,8 +84,8 @@ class GapPipeline:
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
         edges, poses, calibration_of_camera, camera_info = built["segmentation_node"]
         tracking, validity, calibration_of_lens, source, _ = built["tracking_node"]
-        if calibration_of_camera.scope_turn_notch != calibration_of_lens.scope_turn_notch:
-            raise BagError("scope_turn_notch must be the same for segmentation_node and tracking_node")
+        if calibration_of_camera.scope_rotation_notch != calibration_of_lens.scope_rotation_notch:
+            raise BagError("scope_rotation_notch must be the same for segmentation_node and tracking_node")
         if calibration_of_camera.used_in != calibration_of_lens.used_in:
             raise BagError("medium must be the same for segmentation_node and tracking_node")
         try:
@@ -93,12 +93,15 @@ class GapPipeline:
                 edges,
                 poses,
                 calibration_of_camera.load(),
-                by_notch=calibration_of_camera.scope_turn_notch,
+                by_notch=calibration_of_camera.scope_rotation_notch,
                 medium=calibration_of_camera.used_in,
                 camera_info_medium=camera_info.calibrated_in,
             )
             tracker = ScopeTracker(
-                tracking, validity, calibration_of_lens.load(), by_notch=calibration_of_lens.scope_turn_notch
+                tracking,
+                validity,
+                calibration_of_lens.load(),
+                by_notch=calibration_of_lens.scope_rotation_notch,
             )
         except PerceptionError as error:
             raise BagError(str(error)) from None
@@ -131,7 +134,7 @@ class GapPipeline:
         self._body_names = {topics.body_pose: SCOPE}
         for topic, name in (
             ("reference_body/pose", tracker.parameters.reference_body),
-            ("scope_turn_body/pose", tracker.parameters.scope_turn_body),
+            ("scope_rotation_body/pose", tracker.parameters.scope_rotation_body),
         ):
             if name:
                 self._body_names[f"{space}/{topic}"] = name
@@ -147,7 +150,7 @@ class GapPipeline:
                 blank("knee_gap_msgs/msg/ScopeCalibration"),
                 node,
                 calibration,
-                turn_followed=node == "tracking_node" and tracker.follows_turn,
+                rotation_followed=node == "tracking_node" and tracker.follows_rotation,
                 medium=medium,
             )
             for node, calibration in used.items()
@@ -180,10 +183,10 @@ class GapPipeline:
                 **self.outputs,
                 self._topic("scope_notch"): ("knee_gap_msgs/msg/ScopeNotch", "reliable"),
             }
-        if tracker.follows_turn:
+        if tracker.follows_rotation:
             self.outputs = {
                 **self.outputs,
-                self._topic("scope_turn"): ("knee_gap_msgs/msg/ScopeTurn", "reliable"),
+                self._topic("scope_rotation"): ("knee_gap_msgs/msg/ScopeRotation", "reliable"),
             }
         if with_mask:
             self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
@@ -193,7 +196,7 @@ class GapPipeline:
         if self._newest_stamp_ns is not None:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
         else:
-            yield from self._told_calibrations(stamp_ns)
+            yield from self._reported_calibrations(stamp_ns)
         self._newest_stamp_ns = stamp_ns
         # Before the message is taken: what it could not wait for any longer is without it, as live.
         yield from self._looked_at(self._detector.ready(self._now_ns))
@@ -229,10 +232,10 @@ class GapPipeline:
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
         yield from self._estimated("end", lambda: self._estimator.advance(self._now_ns + wait_ns + 1))
 
-    def _told_calibrations(self, stamp_ns: int) -> Iterator[Output]:
-        for told in self._calibrations:
-            self._estimator.add_calibration(messages.calibration_from_message(told))
-            yield Output(self._topic("scope_calibration"), told, stamp_ns)
+    def _reported_calibrations(self, stamp_ns: int) -> Iterator[Output]:
+        for reported in self._calibrations:
+            self._estimator.add_calibration(messages.calibration_from_message(reported))
+            yield Output(self._topic("scope_calibration"), reported, stamp_ns)
 
     def _tracked(self, name: str, message: Any) -> list[LensPose | Refusal]:
         self._bodies.put(name, message)
@@ -248,39 +251,39 @@ class GapPipeline:
         return []
 
     def _on_image(self, what: str, message: Any) -> Iterator[Output]:
-        sights: list[NotchSight] = []
+        observations: list[NotchObservation] = []
 
         def look() -> None:
-            if (sight := self._detector.on_image(message, self._now_ns)) is not None:
-                sights.append(sight)
+            if (observation := self._detector.on_image(message, self._now_ns)) is not None:
+                observations.append(observation)
 
         yield from self._segmented(what, look)
-        for sight in sights:
-            yield from self._on_notch(sight, str(message.header.frame_id))
+        for observation in observations:
+            yield from self._on_notch(observation, str(message.header.frame_id))
 
-    def _on_notch(self, sight: NotchSight, frame_id: str) -> Iterator[Output]:
-        told = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), sight, frame_id)
-        yield Output(self._topic("scope_notch"), told, sight.stamp_ns)
-        sight = notch_from_message(told)
+    def _on_notch(self, observation: NotchObservation, frame_id: str) -> Iterator[Output]:
+        reported = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), observation, frame_id)
+        yield Output(self._topic("scope_notch"), reported, observation.stamp_ns)
+        observation = notch_from_message(reported)
         yield from self._on_lenses(
-            self._seam.call("notch", self._restart_tracker, lambda: self._tracker.take_notch(sight))
+            self._seam.call("notch", self._restart_tracker, lambda: self._tracker.take_notch(observation))
         )
 
     def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output]:
         for lens in lenses:
             if not isinstance(lens, LensPose):
                 continue
-            if self._tracker.follows_turn:
-                turn = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), lens)
-                yield Output(self._topic("scope_turn"), turn, lens.stamp_ns)
-                yield from self._estimated("scope_turn", partial(self._on_turn, turn))
+            if self._tracker.follows_rotation:
+                turn = fill_scope_rotation(blank("knee_gap_msgs/msg/ScopeRotation"), lens)
+                yield Output(self._topic("scope_rotation"), turn, lens.stamp_ns)
+                yield from self._estimated("scope_rotation", partial(self._on_turn, turn))
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
             yield from self._estimated("scope_pose", partial(self._on_pose, pose))
             yield from self._segmented("scope_pose", partial(self._detector.on_lens_pose, pose))
 
     def _on_turn(self, turn: Any) -> list[GapEstimate]:
-        return self._estimator.add_turn(messages.turn_from_message(turn), self._now_ns)
+        return self._estimator.add_rotation(messages.rotation_from_message(turn), self._now_ns)
 
     def _on_pose(self, pose: Any) -> list[GapEstimate]:
         return self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)

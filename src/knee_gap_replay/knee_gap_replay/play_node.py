@@ -18,14 +18,21 @@ from rclpy.time import Time
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from knee_gap_node.base_node import GuardedNode
-from knee_gap_node.parameters import refuse_unknown, refused_by_ros, require_files
-from knee_gap_replay import qos as qos_profiles
-from knee_gap_replay.bag import BagReader, Topic
-from knee_gap_replay.command_line import Parser, not_negative, positive, run, stop_on_signals, with_progress
-from knee_gap_replay.errors import BagError
+from knee_gap_core.bag import qos as qos_profiles
+from knee_gap_core.bag.bag import BagReader, Topic
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import check_type_hash, message_class
+from knee_gap_core.node.base_node import GuardedNode
+from knee_gap_core.node.command_line import (
+    Parser,
+    not_negative,
+    positive,
+    run,
+    stop_on_signals,
+    with_progress,
+)
+from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay.playback import Event, Pace, Played, play_once, with_clock, without_clock
-from knee_gap_replay.types import check_type_hash, message_class
 
 _LOG = logging.getLogger(__name__)
 # Two seconds of a tracker, four of images: what a reliable subscriber may fall behind without loss. It is

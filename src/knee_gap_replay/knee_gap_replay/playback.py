@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-from knee_gap_replay.bag import BagMessage
+from knee_gap_core.bag.bag import BagMessage
 
 CLOCK_PERIOD_NS = 10_000_000
 

@@ -9,9 +9,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.command_line import Parser, run
-from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.node.command_line import Parser, run
+from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
@@ -43,8 +43,8 @@ def _run(arguments: argparse.Namespace) -> int:
             counts = process(reader, writer, pipeline)
     for flaw in pipeline.flaws():
         print(f"process: {flaw}")
-    told = ", ".join(f"{count} {topic}" for topic, count in counts.items())
-    print(f"process: {told} in {arguments.out}")
+    summary = ", ".join(f"{count} {topic}" for topic, count in counts.items())
+    print(f"process: {summary} in {arguments.out}")
     return 0
 
 

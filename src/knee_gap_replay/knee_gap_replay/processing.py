@@ -9,10 +9,10 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from knee_gap_replay.bag import BagMessage, BagReader, BagWriter
-from knee_gap_replay.command_line import with_progress
-from knee_gap_replay.errors import BagError
-from knee_gap_replay.qos import QosName
+from knee_gap_core.bag.bag import BagMessage, BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.qos import QosName
+from knee_gap_core.node.command_line import with_progress
 
 _LOG = logging.getLogger(__name__)
 

@@ -20,14 +20,14 @@ from rclpy.utilities import remove_ros_args
 from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 
-from knee_gap_node.base_node import GuardedNode
-from knee_gap_node.parameters import refuse_unknown, refused_by_ros, require_files
-from knee_gap_replay.bag import BagMessage, BagWriter
-from knee_gap_replay.command_line import Parser, positive, run, stop_on_signals
-from knee_gap_replay.errors import BagError
-from knee_gap_replay.qos import PROFILES
+from knee_gap_core.bag.bag import BagMessage, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import known_type, message_class
+from knee_gap_core.bag.qos import PROFILES
+from knee_gap_core.node.base_node import GuardedNode
+from knee_gap_core.node.command_line import Parser, positive, run, stop_on_signals
+from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay.recording import WriterThread
-from knee_gap_replay.types import known_type, message_class
 
 _LOG = logging.getLogger(__name__)
 # One second of a tracker at 240 Hz, four of images: how long a busy machine may keep the recorder away.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rosbags.interfaces import Qos
 
-from knee_gap_replay.bag import BagMessage, BagWriter
+from knee_gap_core.bag.bag import BagMessage, BagWriter
 
 # How much a recorder that is killed loses at most.
 _FLUSH_SECONDS = 0.5

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from knee_gap_node.command_line import Parser
-from knee_gap_node.user_files import FileError, open_file
-from knee_gap_simulation.bench import Bench
+from knee_gap_core.node.arguments import Parser
+from knee_gap_core.user_files import FileError, open_file
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.hardness import LEVELS
-from knee_gap_simulation.imaging import ByteImage
+from knee_gap_simulation.knee.difficulty import LEVELS
+from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.scope.imaging import ByteImage
 
 _SIZE_PX = 400
 _LABEL_PX = 34
@@ -77,9 +77,9 @@ def _spread_frames(path: Path) -> list[ByteImage]:
 
 
 def _moment(level: int, seed: int) -> ByteImage:
-    bench = Bench(level, seed)
-    index = round(_MOMENTS_S[level] * bench.settings.fps)
-    return next(bench.frames(index, index + 1)).image
+    simulator = KneeSimulator(level, seed)
+    index = round(_MOMENTS_S[level] * simulator.settings.fps)
+    return next(simulator.frames(index, index + 1)).image
 
 
 def _tile(image: ByteImage) -> ByteImage:

@@ -1,7 +1,7 @@
 """Entry points of the package's executables, which can be stopped while their modules are imported."""
 
-from knee_gap_node.entry import entry
+from knee_gap_core.node.entry import entry
 
 contact_sheet = entry("knee_gap_simulation.contact_sheet")
 make_bag = entry("knee_gap_simulation.make_bag")
-natnet_server = entry("knee_gap_simulation.natnet_server_command")
+natnet_server = entry("knee_gap_simulation.natnet.command")

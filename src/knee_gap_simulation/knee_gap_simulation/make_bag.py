@@ -12,37 +12,38 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from knee_gap_node.command_line import Parser, finite
-from knee_gap_node.user_files import flaw_of_new
-from knee_gap_replay.errors import BagError
-from knee_gap_simulation.bench import FROM_SEED, Bench
-from knee_gap_simulation.calibration_bag import (
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_core.user_files import flaw_of_new
+from knee_gap_core.values.arrays import Array
+from knee_gap_simulation.calibration.bag import (
     BOARDS,
     LENSES,
     CalibrationRecording,
     calibration_truth,
     make_calibration_bag,
 )
-from knee_gap_simulation.calibration_scene import TurnedScope
-from knee_gap_simulation.clocks import image_times, stamp_ns, tracker_times
+from knee_gap_simulation.calibration.scene import RotatedScope
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.hardness import Hardness
-from knee_gap_simulation.imaging import Sensor, jpeg
-from knee_gap_simulation.lens import Lens
-from knee_gap_simulation.media import INDICES, Media, Medium, RefractedLens, index_of
-from knee_gap_simulation.motion import HandMotion, TravelDirection
-from knee_gap_simulation.recording import (
+from knee_gap_simulation.knee.difficulty import Difficulty
+from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator
+from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
     Sample,
     pose_samples,
     write_parameters,
     write_recording,
 )
-from knee_gap_simulation.render import ScopeCamera
-from knee_gap_simulation.rigid import FloatArray, inverse
-from knee_gap_simulation.rims import RimScene
-from knee_gap_simulation.tracker import track_lens, world_from_scene
-from knee_gap_simulation.truth import SceneTruth
+from knee_gap_simulation.recordings.scene_truth import SceneTruth
+from knee_gap_simulation.rigid import inverse
+from knee_gap_simulation.rims.render import ScopeCamera
+from knee_gap_simulation.rims.scene import RimScene
+from knee_gap_simulation.scope.clocks import image_times, stamp_ns, tracker_times
+from knee_gap_simulation.scope.hand_motion import HandMotion, TravelDirection
+from knee_gap_simulation.scope.imaging import Sensor, jpeg
+from knee_gap_simulation.scope.lens import Lens
+from knee_gap_simulation.scope.media import INDICES, Media, Medium, RefractedLens, index_of
+from knee_gap_simulation.scope.tracker import track_lens, world_from_scene
 
 TURN_BEGIN_S = 0.5
 TURN_PERIOD_S = 4.0  # of a turn to and fro
@@ -103,7 +104,7 @@ class Recording:
         if self.turn is not None and self.scope_of is None:
             raise SimulationError("only a scope of a calibration bag is turned: say --scope-of as well")
 
-    def turn_at(self, time: npt.ArrayLike) -> FloatArray:
+    def turn_at(self, time: npt.ArrayLike) -> Array:
         """Turn [rad] of the scope in its camera head at times (...) [s]."""
         since = np.maximum(np.asarray(time, dtype=np.float64) - TURN_BEGIN_S, 0.0)
         return np.asarray((self.turn or 0.0) * 0.5 * (1.0 - np.cos(2.0 * np.pi * since / TURN_PERIOD_S)))
@@ -112,11 +113,11 @@ class Recording:
 class _View:
     """Where the lens is in the scene, and where its notch is in the picture, at any time [s]."""
 
-    def __init__(self, recording: Recording, motion: HandMotion, scope: TurnedScope) -> None:
+    def __init__(self, recording: Recording, motion: HandMotion, scope: RotatedScope) -> None:
         self._recording, self._motion, self._scope = recording, motion, scope
         self._T_lens_body = inverse(scope.body_to_lens(0.0))
 
-    def lens(self, time: float) -> FloatArray:
+    def lens(self, time: float) -> Array:
         """``T_scene_lens`` (4, 4): the hand moves the camera head, in which the scope turns."""
         straight = self._motion.poses(time)
         if self._recording.turn is None:
@@ -138,7 +139,7 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
     SimulationError for a recording that cannot be made and BagError where the bag cannot be written.
     """
     scene = RimScene.random(recording.gap, recording.seed)
-    lens, turned = Lens(), TurnedScope()
+    lens, turned = Lens(), RotatedScope()
     if recording.scope_of is not None:
         of_scope = calibration_truth(CalibrationRecording(seed=recording.scope_of))
         lens, turned = of_scope.lens, of_scope.scope
@@ -169,21 +170,26 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
     return truth
 
 
-def make_knee_bag(path: Path, bench: Bench, *, progress: bool = True) -> SceneTruth:
+def make_knee_bag(path: Path, simulator: KneeSimulator, *, progress: bool = True) -> SceneTruth:
     """Render a bench into a new bag at ``path``, as `make_bag` does, and return its truth."""
     truth = SceneTruth(
-        bench.scene, bench.T_world_scene, bench.lens, bench.scope, bench.probe, bench.settings.media
+        simulator.scene,
+        simulator.T_world_scene,
+        simulator.lens,
+        simulator.scope,
+        simulator.probe,
+        simulator.settings.media,
     )
-    times, bodies, lenses = bench.tracked_body_poses()
+    times, bodies, lenses = simulator.tracked_body_poses()
     _write(
         path,
         truth,
         merge(
-            pose_samples(times, bodies, lenses, bench.scope.body_to_lens()),
-            _knee_images(bench, progress=progress),
+            pose_samples(times, bodies, lenses, simulator.scope.body_to_lens()),
+            _knee_images(simulator, progress=progress),
             key=lambda sample: sample.record_ns,
         ),
-        bench=bench.settings.as_dict(),
+        simulator=simulator.settings.as_dict(),
     )
     return truth
 
@@ -198,11 +204,11 @@ def _rim_images(recording: Recording, truth: SceneTruth, view: _View, *, progres
     assert isinstance(truth.scene, RimScene)
     camera = ScopeCamera(truth.scene, truth.lens, sensor=sensor, seed=recording.seed)
     times = image_times(recording.duration_s, recording.fps)
-    with _Told(len(times), progress=progress) as told:
+    with _Progress(len(times), progress=progress) as progress_line:
         for time in times:
             T_scene_lens = view.lens(time)
             image = camera.frame(T_scene_lens, 1.0 / recording.fps, view.notch(time))
-            told.one_more()
+            progress_line.one_more()
             yield Sample(
                 stamp_ns(time + recording.video_delay),
                 jpeg=jpeg(image, recording.quality),
@@ -210,14 +216,14 @@ def _rim_images(recording: Recording, truth: SceneTruth, view: _View, *, progres
             )
 
 
-def _knee_images(bench: Bench, *, progress: bool) -> Iterator[Sample]:
-    with _Told(bench.frame_count, progress=progress) as told:
-        for frame in bench.frames():
-            told.one_more()
+def _knee_images(simulator: KneeSimulator, *, progress: bool) -> Iterator[Sample]:
+    with _Progress(simulator.frame_count, progress=progress) as progress_line:
+        for frame in simulator.frames():
+            progress_line.one_more()
             yield Sample(frame.stamp_ns, jpeg=frame.jpeg, T_world_lens=frame.T_world_lens)
 
 
-class _Told:
+class _Progress:
     """Tells of rendered images: a bar on a terminal, a line every 60 images elsewhere."""
 
     def __init__(self, count: int, *, progress: bool) -> None:
@@ -225,7 +231,7 @@ class _Told:
         hidden = not progress or self._lines
         self._bar = tqdm(total=count, desc="rendering", unit="image", disable=hidden)
 
-    def __enter__(self) -> "_Told":
+    def __enter__(self) -> "_Progress":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -239,13 +245,13 @@ class _Told:
             print(f"rendering: {self._done} of {self._count} images", file=sys.stderr)
 
 
-def hardness_argument(text: str) -> tuple[str, int]:
-    """A hardness and its level from NAME=LEVEL. Raises argparse.ArgumentTypeError."""
+def difficulty_argument(text: str) -> tuple[str, int]:
+    """A difficulty and its level from NAME=LEVEL. Raises argparse.ArgumentTypeError."""
     name, _, level = text.partition("=")
     if not level.isdigit():
         raise argparse.ArgumentTypeError(f"'{text}' is not NAME=LEVEL, as debris=3")
     try:
-        Hardness.at(0, {name: int(level)})
+        Difficulty.at(0, {name: int(level)})
     except SimulationError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return name, int(level)
@@ -274,12 +280,12 @@ def _parser() -> Parser:
     parser.add_argument("--quality", type=int, help="of the JPEG images of the rims, 1-100 (60)")
     parser.add_argument("--level", type=int, choices=range(4), help="a knee, this hard to see")
     parser.add_argument(
-        "--hardness",
-        type=hardness_argument,
+        "--difficulty",
+        type=difficulty_argument,
         action="append",
         default=[],
         metavar="NAME=LEVEL",
-        help=f"of a knee, one by one: {', '.join(Hardness.__dataclass_fields__)}",
+        help=f"of a knee, one by one: {', '.join(Difficulty.__dataclass_fields__)}",
     )
     parser.add_argument(
         "--travel-direction", choices=[str(d) for d in TravelDirection], help="in a knee (along the gap)"
@@ -327,14 +333,14 @@ def medium_argument(text: str) -> Medium:
     return text if text in INDICES else index
 
 
-def _knee(arguments: argparse.Namespace) -> Bench:
+def _knee(arguments: argparse.Namespace) -> KneeSimulator:
     if arguments.quality is not None:
         raise SimulationError("--quality is for the rims; a knee's JPEG quality follows its noise level")
     if arguments.no_gap and arguments.gap_mm is not None:
         raise SimulationError("--no-gap and --gap-mm exclude each other")
     defaults = Recording()
     gap = FROM_SEED if arguments.gap_mm is None else 1e-3 * arguments.gap_mm
-    return Bench(
+    return KneeSimulator(
         arguments.level or 0,
         arguments.seed,
         arguments.travel_direction or TravelDirection.ALONG,
@@ -343,7 +349,7 @@ def _knee(arguments: argparse.Namespace) -> Bench:
         travel=1e-3 * arguments.travel_mm,
         duration_s=4.0 if arguments.duration_s is None else arguments.duration_s,
         fps=defaults.fps if arguments.fps is None else arguments.fps,
-        hardness=dict(arguments.hardness),
+        difficulty=dict(arguments.difficulty),
         medium=arguments.medium or "saline",
         calibrated_in=arguments.calibrated_in,
         portal=_portal(arguments),
@@ -382,7 +388,7 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
         arguments.calibrated_in,
         arguments.portal_mm,
     )
-    if arguments.no_gap or arguments.hardness or any(value is not None for value in others):
+    if arguments.no_gap or arguments.difficulty or any(value is not None for value in others):
         raise SimulationError(
             "--calibration shows a board: there is no gap, knee, depth, portal or other medium to choose"
         )
@@ -400,10 +406,10 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
     )
 
 
-def _told_times(times: Iterator[float], count: int) -> Iterator[float]:
-    with _Told(count, progress=True) as told:
+def _printed_times(times: Iterator[float], count: int) -> Iterator[float]:
+    with _Progress(count, progress=True) as progress_line:
         for time in times:
-            told.one_more()
+            progress_line.one_more()
             yield time
 
 
@@ -414,14 +420,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     of_rims = (
         turned or arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
     )
-    of_a_knee = arguments.hardness or arguments.no_gap or arguments.travel_direction
+    of_a_knee = arguments.difficulty or arguments.no_gap or arguments.travel_direction
     try:
         if (arguments.board or arguments.lens) and not arguments.calibration:
             raise SimulationError("--board and --lens are for --calibration")
         if flaw := flaw_of_new(arguments.out):
             raise BagError(flaw)
         if arguments.calibration:
-            make_calibration_bag(arguments.out, _calibration(arguments), _told_times)
+            make_calibration_bag(arguments.out, _calibration(arguments), _printed_times)
         elif arguments.level is not None or of_a_knee:
             if of_rims:
                 raise SimulationError(

@@ -13,18 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.errors import (
+    BaselineTooShortError,
+    CheiralityError,
+    EpipoleError,
     MeasurementError,
-    ParallelToTravelError,
-    RaysMeetBehindError,
-    TravelTooShortError,
-    UnboundedError,
+    UnderconstrainedError,
 )
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.joint_motion import Finding
-from knee_gap_uncertainty.pose_buffer import LensPose, PoseRefusal
-from knee_gap_uncertainty.scope_turns import TurnRefusal
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
+from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal
+from knee_gap_uncertainty.joint_motion.joint_motion import Finding
 
 # Along the line of the ray from the other view, one of two views may be wrong by any amount.
 FEWEST_VIEWS_TO_CHECK = 3
@@ -45,7 +45,7 @@ class Reason(StrEnum):
     LATE = "the answer is too old when it leaves"
     NO_POSE_FOLLOWS = "no lens pose follows the image"
     NO_POSE = "no lens pose is near enough to the image's stamp"
-    NO_TURN = TurnRefusal.NONE_NEAR.value
+    NO_TURN = RotationRefusal.NONE_NEAR.value
     CALIBRATION = "the calibrations of the nodes cannot be used"
     LEG_LOST = "the leg body is not tracked"
     UNKNOWN_MOTION = (
@@ -111,7 +111,7 @@ class Facts:
     clock_offset: float = float("nan")
     delay: float = 0.0
     pose: LensPose | PoseRefusal | None = None
-    turn: float | TurnRefusal = 0.0
+    turn: float | RotationRefusal = 0.0
     calibration_flaw: str = ""
     leg_flaw: str = ""
     needs_motion: bool = False
@@ -178,7 +178,7 @@ RULES: tuple[Rule, ...] = (
         detail=lambda f: str(f.pose),
     ),
     Rule(Reason.LATE, GapStatus.OUT_OF_SYNC, lambda f: f.delay > f.parameters.max_delay),
-    Rule(Reason.NO_TURN, GapStatus.OUT_OF_SYNC, lambda f: isinstance(f.turn, TurnRefusal)),
+    Rule(Reason.NO_TURN, GapStatus.OUT_OF_SYNC, lambda f: isinstance(f.turn, RotationRefusal)),
     # What all views of a track rest on.
     Rule(
         Reason.CALIBRATION,
@@ -196,10 +196,10 @@ RULES: tuple[Rule, ...] = (
     # The views of the track.
     Rule(Reason.CONTRADICTED, GapStatus.UNKNOWN, lambda f: f.finding is Finding.CONTRADICTION),
     Rule(Reason.MOVED, GapStatus.JOINT_MOVED, lambda f: f.finding is Finding.MOVED),
-    Rule(Reason.HARDLY_MOVED, GapStatus.INSUFFICIENT_PARALLAX, _raised(TravelTooShortError)),
-    Rule(Reason.ALONG_THE_TRAVEL, GapStatus.INSUFFICIENT_PARALLAX, _raised(ParallelToTravelError)),
-    Rule(Reason.RAYS_MEET_BEHIND, GapStatus.INSUFFICIENT_PARALLAX, _raised(RaysMeetBehindError)),
-    Rule(Reason.PARALLEL_RAYS, GapStatus.INSUFFICIENT_PARALLAX, _raised(UnboundedError)),
+    Rule(Reason.HARDLY_MOVED, GapStatus.INSUFFICIENT_PARALLAX, _raised(BaselineTooShortError)),
+    Rule(Reason.ALONG_THE_TRAVEL, GapStatus.INSUFFICIENT_PARALLAX, _raised(EpipoleError)),
+    Rule(Reason.RAYS_MEET_BEHIND, GapStatus.INSUFFICIENT_PARALLAX, _raised(CheiralityError)),
+    Rule(Reason.PARALLEL_RAYS, GapStatus.INSUFFICIENT_PARALLAX, _raised(UnderconstrainedError)),
     Rule(
         Reason.NO_NUMBERS,
         GapStatus.UNKNOWN,

@@ -9,17 +9,17 @@ class BadInputError(MeasurementError):
     """A value that cannot be: not finite, not a unit vector, negative, of the wrong shape, not a choice."""
 
 
-class TravelTooShortError(MeasurementError):
+class BaselineTooShortError(MeasurementError):
     """The lens positions are closer than their errors: even the direction of travel is unknown."""
 
 
-class ParallelToTravelError(MeasurementError):
+class EpipoleError(MeasurementError):
     """A bearing lies along the travel, within the admitted error: it spans no triangle with it."""
 
 
-class RaysMeetBehindError(MeasurementError):
+class CheiralityError(MeasurementError):
     """The two rays to a point do not meet in front of both lenses."""
 
 
-class UnboundedError(MeasurementError):
+class UnderconstrainedError(MeasurementError):
     """The two rays to a point are parallel: it is at infinity, and no gap can be told."""

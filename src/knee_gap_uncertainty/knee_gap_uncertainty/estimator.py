@@ -11,19 +11,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.acceptance import Facts, Verdict, judge
-from knee_gap_uncertainty.advice_task import PIECES, AdviceTask
 from knee_gap_uncertainty.delays import NANOSECONDS, DelayFloor
 from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.gap_profile import GapProfile
-from knee_gap_uncertainty.leg_body import LegBody
-from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice, Situation
-from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer, PoseRefusal
-from knee_gap_uncertainty.scope_calibration import ScopeCalibration, contradiction, shared_error
-from knee_gap_uncertainty.scope_turns import ScopeTurn, ScopeTurns, TurnRefusal
-from knee_gap_uncertainty.track import Track
+from knee_gap_uncertainty.gap_track import Track
+from knee_gap_uncertainty.inputs.leg_body import LegBody
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal, ScopeRotation, ScopeRotations
+from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdviceTask
+from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice, Situation
+from knee_gap_uncertainty.scope_calibration.scope_calibration import (
+    ScopeCalibration,
+    contradiction,
+    shared_error,
+)
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
@@ -57,9 +61,9 @@ class GapEstimator:
         self.counts: Counter[str] = Counter()
         self.latest: GapEstimate | None = None
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
-        self._turns = ScopeTurns(self.parameters.max_pose_age)
+        self._turns = ScopeRotations(self.parameters.max_pose_age)
         # Whether a turn was ever told: it is followed then, and an image without one is of an unknown scope.
-        self._turn_told = False
+        self._rotation_reported = False
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
         self._leg = LegBody(self.parameters.max_pose_age) if self.parameters.leg_motion > 0.0 else None
@@ -74,7 +78,7 @@ class GapEstimator:
         # By how much the clock was ahead of the stamps of the latest poses: what an image's delay is held to.
         self._delays = DelayFloor()
         self._last_edges: Pending | None = None
-        self._silence_told_ns = 0
+        self._silence_reported_ns = 0
         self._now_ns = 0
 
     @property
@@ -97,15 +101,15 @@ class GapEstimator:
             self._delays.take(delay_ns, arrival_ns, is_live=self._is_live and near)
         return self._resolve(arrival_ns)
 
-    def add_turn(self, told: ScopeTurn, arrival_ns: int) -> list[GapEstimate]:
+    def add_rotation(self, reported: ScopeRotation, arrival_ns: int) -> list[GapEstimate]:
         """Take how far the scope is turned in its camera head; return the estimates that it made possible."""
         self._turn_clock(arrival_ns)
-        if not self._turn_is_followed():
+        if not self._rotation_is_followed():
             # The views before had none.
             self._track = None
-        self._turn_told = True
-        if refusal := self._turns.add(told):
-            self.counts[f"scope_turn refused: {refusal.value}"] += 1
+        self._rotation_reported = True
+        if refusal := self._turns.add(reported):
+            self.counts[f"scope_rotation refused: {refusal.value}"] += 1
         return self._resolve(arrival_ns)
 
     def add_leg_pose(self, pose: LensPose) -> None:
@@ -116,21 +120,21 @@ class GapEstimator:
         if refusal is not None:
             self.counts[f"leg body refused: {refusal.value}"] += 1
 
-    def add_calibration(self, told: ScopeCalibration) -> None:
+    def add_calibration(self, reported: ScopeCalibration) -> None:
         """Take what a node says of its calibration.
 
         Where nodes contradict each other, or tell an error that is none, nothing is valid.
         """
-        known = self.calibrations.get(told.node)
+        known = self.calibrations.get(reported.node)
         if known is None and len(self.calibrations) == MOST_NODES:
             self.counts["calibrations of more nodes than there can be"] += 1
             self.calibration_flaw = f"more than {MOST_NODES} nodes state a calibration of the scope"
             return
-        self.calibrations[told.node] = told
+        self.calibrations[reported.node] = reported
         flaws = [contradiction(self.calibrations), *(one.flaw() for one in self.calibrations.values())]
         self.calibration_flaw = next((flaw for flaw in flaws if flaw), "")
         self._calibration_error = shared_error(self.calibrations.values(), self.parameters)
-        if known is None or not told.says_the_same_as(known):
+        if known is None or not reported.says_the_same_as(known):
             # Views by another calibration are not comparable with those before.
             self._track = None
 
@@ -148,7 +152,7 @@ class GapEstimator:
             self._delays.clear()
             self._track = None
         self._last_edges = Pending(edges, arrival_ns)
-        self._silence_told_ns = arrival_ns
+        self._silence_reported_ns = arrival_ns
         if len(self._pending) == MOST_PENDING:
             self.counts["images dropped while waiting for poses"] += 1
             self._pending.popleft()
@@ -166,7 +170,7 @@ class GapEstimator:
         estimates = self._resolve(now_ns)
         if self._pending or (self._last_edges is None and not self._is_live):
             return estimates
-        if now_ns - self._silence_told_ns > self.parameters.max_edges_silence * NANOSECONDS:
+        if now_ns - self._silence_reported_ns > self.parameters.max_edges_silence * NANOSECONDS:
             estimates.append(self._silence(now_ns))
         return estimates
 
@@ -186,7 +190,7 @@ class GapEstimator:
 
     def _silence(self, now_ns: int) -> GapEstimate:
         """Statement that no image comes."""
-        self._silence_told_ns = now_ns
+        self._silence_reported_ns = now_ns
         last = self._last_edges
         # The only stamp that is not an image's: no image came, and the statement needs a time.
         stamp_ns = now_ns if last is None else last.edges.stamp_ns + now_ns - last.arrival_ns
@@ -217,7 +221,7 @@ class GapEstimator:
             self._delays.clear()
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
-                self._silence_told_ns = now_ns
+                self._silence_reported_ns = now_ns
         self._now_ns = now_ns
 
     def _resolve(self, now_ns: int) -> list[GapEstimate]:
@@ -241,21 +245,21 @@ class GapEstimator:
             clock_offset=1e-9 * (pending.arrival_ns - edges.stamp_ns) if self._is_live else np.nan,
             delay=self._delays.excess(pending.arrival_ns - edges.stamp_ns),
             pose=self._poses.at(edges.stamp_ns),
-            turn=self._turns.at(edges.stamp_ns) if self._turn_is_followed() else 0.0,
+            turn=self._turns.at(edges.stamp_ns) if self._rotation_is_followed() else 0.0,
         )
-        awaited = facts.pose is PoseRefusal.NOT_YET or facts.turn is TurnRefusal.NOT_YET
+        awaited = facts.pose is PoseRefusal.NOT_YET or facts.turn is RotationRefusal.NOT_YET
         may_wait = now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS
         if awaited and may_wait and not facts.edges_flaw:
             return None
         if verdict := judge(facts):
             return self._without(edges.stamp_ns, edges.track_id, verdict)
         assert isinstance(facts.pose, LensPose)
-        assert not isinstance(facts.turn, TurnRefusal)
-        return self._measure(facts, edges, replace(facts.pose, scope_turn=facts.turn))
+        assert not isinstance(facts.turn, RotationRefusal)
+        return self._measure(facts, edges, replace(facts.pose, scope_rotation=facts.turn))
 
-    def _turn_is_followed(self) -> bool:
+    def _rotation_is_followed(self) -> bool:
         """Whether somebody tells, or says that he will, how far the scope is turned in its camera head."""
-        return self._turn_told or any(one.turn_followed for one in self.calibrations.values())
+        return self._rotation_reported or any(one.rotation_followed for one in self.calibrations.values())
 
     def _measure(self, facts: Facts, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
         """Estimate from the edges and their lens pose, within the track that they belong to."""

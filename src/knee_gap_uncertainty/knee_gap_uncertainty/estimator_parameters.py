@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from knee_gap_node.parameter_rules import broken_rule
+from knee_gap_core.node.parameter_rules import broken_rule
 from knee_gap_uncertainty.errors import MeasurementError
 
 # Of a scope that is known exactly, as a simulated one is: nothing of it is uncalibrated.
@@ -52,7 +52,7 @@ class EstimatorParameters:
             "range": (0.0, 1.0),
         },
     )
-    depth_drift: float = field(
+    scale_drift: float = field(
         default=0.002,
         metadata={
             "description": "standard deviation of the share of its parallax by which the image carries a "
@@ -61,7 +61,7 @@ class EstimatorParameters:
             "range": (0.0, 0.1),
         },
     )
-    lasting_share: float = field(
+    correlated_error_share: float = field(
         default=1.0,
         metadata={
             "description": "share of the bearings' variance along the parallax that lasts over a track: at 1 "

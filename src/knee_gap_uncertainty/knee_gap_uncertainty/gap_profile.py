@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from knee_gap_uncertainty.gap_estimate import EdgeSection
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeSection
 from knee_gap_uncertainty.instrument_gap import (
     ROUGHNESS_BOUND,
     TILTS,
@@ -21,8 +21,6 @@ from knee_gap_uncertainty.instrument_gap import (
     opening_of,
     widest,
 )
-
-Array = npt.NDArray[np.float64]
 
 # How fast the depth of a side may change along the opening [-]: 17 degrees.
 STEEPEST = 0.3

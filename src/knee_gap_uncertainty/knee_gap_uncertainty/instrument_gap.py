@@ -20,15 +20,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from knee_gap_uncertainty.compiled import compiled
-from knee_gap_uncertainty.error_cloud import ring_lengths
-from knee_gap_uncertainty.multi_view import MultiViewFit
-from knee_gap_uncertainty.triangulation import SMALLEST_ANGLE
-from knee_gap_uncertainty.vectors import row, vector
-
-Array = npt.NDArray[np.float64]
+from knee_gap_core.compiled import compiled
+from knee_gap_core.values.arrays import Array
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
+from knee_gap_uncertainty.numerics.vectors import row, vector
+from knee_gap_uncertainty.two_view.error_cloud import ring_lengths
+from knee_gap_uncertainty.two_view.triangulation import SMALLEST_ANGLE
 
 # Half angle of the cone of directions, about the direction of view, from which the instrument may come.
 CONE = np.radians(10.0)

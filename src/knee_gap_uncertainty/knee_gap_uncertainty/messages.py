@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
+from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
 from knee_gap_uncertainty.gap_profile import GapProfile
-from knee_gap_uncertainty.motion_advice import AdviceParameters, MotionAdvice
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.scope_calibration import ScopeCalibration
-from knee_gap_uncertainty.scope_turns import ScopeTurn
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
+from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice
+from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
 VALID_EDGES = 1
 TARGETS = {"snr": 0, "width": 1}
@@ -122,13 +122,13 @@ def calibration_from_message(message: Any) -> ScopeCalibration:
         hash=str(message.hash),
         lens_covariance=np.array(message.lens_covariance, dtype=float).reshape(6, 6),
         time_offset_error=float(message.time_offset_error),
-        turn_followed=bool(message.turn_followed),
+        rotation_followed=bool(message.rotation_followed),
     )
 
 
-def turn_from_message(message: Any) -> ScopeTurn:
-    """What a knee_gap_msgs/ScopeTurn says."""
-    return ScopeTurn(stamp_ns(message.header), float(message.turn))
+def rotation_from_message(message: Any) -> ScopeRotation:
+    """What a knee_gap_msgs/ScopeRotation says."""
+    return ScopeRotation(stamp_ns(message.header), float(message.turn))
 
 
 def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:

@@ -1,13 +1,11 @@
 """The edges of the opening in the frame of the points, carried on for a while where no image shows them."""
 
 import numpy as np
-import numpy.typing as npt
 
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, EdgeState
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
 from knee_gap_uncertainty.instrument_gap import Edges, opening_of
-from knee_gap_uncertainty.posed_view import PosedView
-
-Array = npt.NDArray[np.float64]
+from knee_gap_uncertainty.multi_view.posed_view import PosedView
 
 NOT_YET = "no image of the track has shown the edges of the opening"
 UNSEEN = "the edges of the opening were not seen for too long"

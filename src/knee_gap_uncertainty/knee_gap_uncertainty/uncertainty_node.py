@@ -9,16 +9,17 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
-from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeTurn
-from knee_gap_node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
-from knee_gap_node.seam import Fault
-from knee_gap_uncertainty import gap_estimate, messages
+from knee_gap_core.node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
+from knee_gap_core.node.seam import Fault
+from knee_gap_core.values import gap_estimate
+from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeRotation
+from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.acceptance import Reason
-from knee_gap_uncertainty.advice_task import AdvicePace
 from knee_gap_uncertainty.delays import ContinuedClock
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.motion_advice import AdviceParameters
+from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
+from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 from knee_gap_uncertainty.warm_up import warm_up
 
 # A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
@@ -52,7 +53,7 @@ class UncertaintyNode(BaseNode):
         warm_up()
         self.create_subscription(GapEdges, "gap_edges", self.on_edges, RESULT_QOS)
         # What waits is taken in this order: the turn that is told with a pose before the pose.
-        self.create_subscription(ScopeTurn, "scope_turn", self.on_turn, RESULT_QOS)
+        self.create_subscription(ScopeRotation, "scope_rotation", self.on_rotation, RESULT_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
         if self._estimator.parameters.leg_motion > 0.0:
             self.create_subscription(PoseStamped, "leg_body/pose", self.on_leg_pose, TRACKER_QOS)
@@ -98,9 +99,9 @@ class UncertaintyNode(BaseNode):
         """Take a pose of a body fixed to the leg, which must not move within a track."""
         self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
 
-    def on_turn(self, message: ScopeTurn) -> None:
+    def on_rotation(self, message: ScopeRotation) -> None:
         """Take how far the scope is turned, which may complete images that waited for it."""
-        self.publish(self._estimator.add_turn(messages.turn_from_message(message), self.now_ns()))
+        self.publish(self._estimator.add_rotation(messages.rotation_from_message(message), self.now_ns()))
 
     def on_calibration(self, message: ScopeCalibration) -> None:
         """Take what a node says of its calibration of the scope."""
@@ -134,9 +135,9 @@ class UncertaintyNode(BaseNode):
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
         """Status of the latest estimate, and how often each status and reason came."""
-        latest, told = self._estimator.latest, self._estimator.calibrations
+        latest, reported = self._estimator.latest, self._estimator.calibrations
         counts: dict[str, object] = {
-            f"calibration of {node}": calibration.hash or "none" for node, calibration in told.items()
+            f"calibration of {node}": calibration.hash or "none" for node, calibration in reported.items()
         }
         counts.update(self._estimator.counts)
         if latest is None:

@@ -8,11 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from knee_gap_uncertainty import gap_range, motion_statistics, multi_view
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapStatus
-from knee_gap_uncertainty.motion_advice import AdviceParameters
-from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.joint_motion import motion_statistics
+from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
+from knee_gap_uncertainty.multi_view import maximum_likelihood as multi_view
+from knee_gap_uncertainty.two_view import gap_range
 
 FRAME_NS = 16_666_667
 HALF_POSE_NS = 4_000_000

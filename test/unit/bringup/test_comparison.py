@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from knee_gap_bringup.comparison import EDGES, GAP, Comparison, compare
-from knee_gap_perception.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_perception.messages import fill_gap_edges
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.types import blank
 from knee_gap_simulation.make_bag import Recording, make_bag
-from knee_gap_simulation.recording import LENS_POSE_TRUE
+from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
+from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_simulation.rigid import from_parts, inverse, transform
-from knee_gap_simulation.truth import SceneTruth
-from knee_gap_uncertainty.gap_estimate import GapEstimate, GapStatus
 from knee_gap_uncertainty.messages import fill_gap_estimate, stamp_ns
 
 TRACK = 4

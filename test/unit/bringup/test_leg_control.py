@@ -81,7 +81,7 @@ def test_what_contradicts_itself_holds_the_leg_until_a_person_resets_it(estimate
     assert "until a person resets it" in control.on_estimate(good[0], 10.5).reason
     assert control.reset(11.0) == ""
     assert control.on_estimate(good[1], 11.1).action is Action.HOLD
-    assert control.on_estimate(good[2], 11.4).measure_anew
+    assert control.on_estimate(good[2], 11.4).measure_again
     assert control.on_estimate(good[3]._replace(track_id=10), 11.5).action is Action.OPEN
 
 
@@ -193,7 +193,7 @@ def test_settings_that_contradict_each_other_are_refused(settings, words) -> Non
 
 def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
     control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
-    first, moving, over, during, at_rest, later, late, anew, open_again = images(
+    first, moving, over, during, at_rest, later, late, again, open_again = images(
         NARROW,
         NARROW,
         NARROW,
@@ -207,10 +207,10 @@ def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
     assert control.on_estimate(during, 0.7).action is Action.HOLD
     resting = control.on_estimate(at_rest, 0.85)
     assert resting.action is Action.HOLD
-    assert resting.measure_anew
+    assert resting.measure_again
     assert control.on_estimate(later, 1.0).action is Action.HOLD
-    assert not control.on_estimate(late, 1.1).measure_anew
-    assert control.on_estimate(anew, 2.0).action is Action.PASS
+    assert not control.on_estimate(late, 1.1).measure_again
+    assert control.on_estimate(again, 2.0).action is Action.PASS
     assert control.on_estimate(open_again, 2.1).action is Action.OPEN
 
 
@@ -225,7 +225,7 @@ def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_ca
     control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
     assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
     assert control.on_time(0.1).action is Action.HOLD
-    assert control.on_time(0.45).measure_anew
+    assert control.on_time(0.45).measure_again
     late, fresh = images(NARROW, NARROW._replace(track_id=2, age=0.2))[1:], NARROW._replace(track_id=3)
     assert control.on_estimate(late[0], 0.55).action is Action.HOLD
     assert control.on_estimate(late[0]._replace(stamp_ns=3), 0.6).action is Action.HOLD
@@ -258,7 +258,7 @@ def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
     assert control.on_time(0.19) is None
     assert control.on_time(0.21).opening_rate == 0.0
     assert control.on_estimate(after[0], 0.3).action is Action.HOLD
-    assert control.on_estimate(after[1], 0.6).measure_anew
+    assert control.on_estimate(after[1], 0.6).measure_again
     assert control.on_estimate(after[2], 0.7).action is Action.HOLD
 
 
@@ -267,7 +267,7 @@ def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
     first, over, silent, old = images(NARROW, NARROW, LOST, NARROW)
     assert control.on_estimate(first, 0.0).opening_rate > 0.0
     assert control.on_estimate(over, 0.1).action is Action.HOLD
-    assert control.on_estimate(silent, 0.5).measure_anew
+    assert control.on_estimate(silent, 0.5).measure_again
     assert control.on_estimate(old, 0.6).action is Action.HOLD
 
 

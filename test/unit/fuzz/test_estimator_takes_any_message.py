@@ -10,11 +10,11 @@ from hostile import BEGIN, SETTINGS, header, hurt, numbers, poses, sequences, st
 from hypothesis import given
 from hypothesis import strategies as st
 
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapStatus
-from knee_gap_uncertainty.pose_buffer import LensPose, PoseBuffer
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer
 
 POINTS = np.array([[2e-3, -2e-3, 12e-3], [1e-3, 2.1e-3, 11e-3]])
 BEGIN_NS = BEGIN * 10**9
@@ -53,7 +53,7 @@ def calibration(draw: Any) -> Any:
         lens_covariance=hurt(draw, np.diag([1e-9] * 3 + [1e-7] * 3).ravel(), share=2),
         time_offset=draw(numbers),
         time_offset_error=draw(numbers),
-        turn_followed=draw(st.booleans()),
+        rotation_followed=draw(st.booleans()),
     )
 
 
@@ -67,7 +67,7 @@ def take(estimator: GapEstimator, draw: Any, stamp_ns: int, now_ns: int) -> list
         return estimator.add_edges(messages.edges_from_message(edges(draw, stamp_ns)), now_ns)
     if kind == "turn":
         turn = SimpleNamespace(header=header(stamp_ns), turn=draw(numbers))
-        return estimator.add_turn(messages.turn_from_message(turn), now_ns)
+        return estimator.add_rotation(messages.rotation_from_message(turn), now_ns)
     if kind == "leg":
         estimator.add_leg_pose(messages.leg_pose_from_message(draw(poses(stamp_ns, covered=False))))
     if kind == "calibration":

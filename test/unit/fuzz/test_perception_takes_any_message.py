@@ -12,20 +12,20 @@ from hostile import SETTINGS, header, hurt, numbers, poses, sequences, stamps, s
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knee_gap_perception.camera import camera_from_info
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import EdgeStatus
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_core.values.pose_interpolation import LensPosePredictor
+from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_perception.camera.models import camera_from_info
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.lens_pose_prediction import LensPosePredictor
 from knee_gap_perception.messages import ENCODINGS, image_from_message, lens_pose_from_message
 from knee_gap_perception.messages_tracking import notch_from_message
-from knee_gap_perception.optitrack.body_source import choose_body
-from knee_gap_perception.optitrack.pose_topic import PoseTopics
-from knee_gap_perception.pose_validity import Refusal
-from knee_gap_perception.poses import BodyPose, LensPose
-from knee_gap_perception.segmentation_parameters import PoseParameters
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_perception.turned_poses import Tracked, TurnedPoses
+from knee_gap_perception.scope_pose.pose_validity import Refusal
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_rotation.rotated_poses import RotatedPoses, Tracked
+from knee_gap_perception.trackers.body_source import choose_body
+from knee_gap_perception.trackers.pose_topic import PoseTopics
 
 BEGIN_NS = 10**18
 K = [229.2, 0.0, 320.0, 0.0, 229.2, 180.0, 0.0, 0.0, 1.0]
@@ -75,15 +75,15 @@ def test_poses_at_the_notch(bodies: list[tuple[int, Any]], notches: list[Any]) -
         body = tracked.body
         return LensPose(body.stamp_ns, "w", "l", body.position, body.quaternion_xyzw, 1e-9 * np.eye(6))
 
-    turned = TurnedPoses(lens_of)
-    sights = dict(zip(stamps([step for step, *_ in notches] or [0]), notches, strict=False))
+    turned = RotatedPoses(lens_of)
+    observations = dict(zip(stamps([step for step, *_ in notches] or [0]), notches, strict=False))
     for index, (stamp, _) in enumerate(bodies):
         quaternion = np.array([0.0, 0.0, 0.0, 1.0])
         turned.add_tracked(Tracked(stamp, BodyPose(stamp, np.zeros(3), quaternion), None))
-        if index < len(sights):
-            at, (_, angle, error, seen) = list(sights.items())[index]
+        if index < len(observations):
+            at, (_, angle, error, seen) = list(observations.items())[index]
             message = SimpleNamespace(header=header(at), seen=seen, reason="", angle=angle, angle_error=error)
-            turned.add_sight(notch_from_message(message))
+            turned.add_observation(notch_from_message(message))
         turned.ready()
 
 

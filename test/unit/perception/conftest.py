@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.camera import FisheyeCamera
-
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Array, Image
+from knee_gap_perception.camera.models import FisheyeCamera
 
 TEXEL = 2.0e-5  # [m]
 HALF_GAP = 2.0e-3  # [m]

@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.body_source import UnknownBodyError, choose_body
-from knee_gap_perception.optitrack.natnet_client import NatNetParameters
-from knee_gap_perception.optitrack.pose_topic import PoseTopics
-from knee_gap_perception.optitrack.rigid_bodies import RigidBodiesTopic
-from knee_gap_perception.optitrack.scope_feed import ScopeFeed, SourceParameters
+from knee_gap_perception.trackers.body_source import UnknownBodyError, choose_body
+from knee_gap_perception.trackers.natnet.client import NatNetParameters
+from knee_gap_perception.trackers.pose_topic import PoseTopics
+from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
+from knee_gap_perception.trackers.scope_feed import ScopeFeed, SourceParameters
 
 MILLISECOND = 1_000_000
 

@@ -5,10 +5,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.calibration.boards import CharucoBoard, DotGrid, board_from_text
+from knee_gap_perception.calibrate.measurements.boards import CharucoBoard, DotGrid, board_from_text
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_simulation.calibration_bag import CalibrationMotion, CalibrationRecording, calibration_truth
-from knee_gap_simulation.calibration_scene import BoardCamera
+from knee_gap_simulation.calibration.bag import CalibrationMotion, CalibrationRecording, calibration_truth
+from knee_gap_simulation.calibration.scene import BoardCamera
 
 
 def warped(flat: npt.NDArray[np.uint8], homography: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:

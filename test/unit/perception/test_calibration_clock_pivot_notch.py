@@ -6,24 +6,25 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.image_motion import ImageMotion, image_motion
-from knee_gap_perception.calibration.notch import find_notch
-from knee_gap_perception.calibration.observations import common_angle, still_stamps
-from knee_gap_perception.calibration.pivot import calibrate_pivot
-from knee_gap_perception.calibration.pose_track import PoseTrack
-from knee_gap_perception.calibration.rigid import Array, angle_between, from_vector, inverse, rigid
-from knee_gap_perception.calibration.scope_turn import (
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import angle_between, from_vector, inverse, rigid
+from knee_gap_perception.calibrate.measurements.image_motion import ImageMotion, image_motion
+from knee_gap_perception.calibrate.measurements.pose_track import PoseTrack
+from knee_gap_perception.calibrate.observations import common_angle, still_stamps
+from knee_gap_perception.calibrate.solvers.pivot import calibrate_pivot
+from knee_gap_perception.calibrate.solvers.time_offset import estimate_time_offset
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.image.field_of_view import FieldOfView
+from knee_gap_perception.scope_rotation.notch import find_notch
+from knee_gap_perception.scope_rotation.shaft_axis import (
     Mount,
     ShaftAxis,
     about,
     roll,
+    rotated_lens,
+    rotation_between,
     shaft_axis,
-    turn_between,
-    turned_lens,
 )
-from knee_gap_perception.calibration.time_offset import estimate_time_offset
-from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.field_of_view import FieldOfView
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -170,7 +171,7 @@ def test_turning_a_straight_scope_does_nothing() -> None:
     """With the shaft along the view, turning tip and picture alike leaves every direction where it was."""
     lens = from_vector([0.2, -0.1, 0.3, 0.01, 0.02, 0.2])
     axis = ShaftAxis(lens[:3, 2], lens[:3, 3])
-    assert turned_lens(lens, 0.8, Mount.CAMERA_HEAD, axis) == pytest.approx(lens, abs=1e-12)
+    assert rotated_lens(lens, 0.8, Mount.CAMERA_HEAD, axis) == pytest.approx(lens, abs=1e-12)
 
 
 def test_turning_an_oblique_scope_moves_its_view_around_a_cone() -> None:
@@ -178,22 +179,22 @@ def test_turning_an_oblique_scope_moves_its_view_around_a_cone() -> None:
     lens = shaft @ from_vector([np.radians(30), 0, 0, 0, 0, 0])
     axis = ShaftAxis(shaft[:3, 2], shaft[:3, 3])
     for turn in (0.5, np.pi):
-        turned = turned_lens(lens, turn, Mount.CAMERA_HEAD, axis)
+        turned = rotated_lens(lens, turn, Mount.CAMERA_HEAD, axis)
         assert turned[:3, 2] @ axis.direction == pytest.approx(np.cos(np.radians(30)))
         assert turned[:3, :3] @ about([0, 0, 1], turn)[:, 0] == pytest.approx(
             about(axis.direction, turn) @ lens[:3, 0]
         )
-    opposite = turned_lens(lens, np.pi, Mount.CAMERA_HEAD, axis)
+    opposite = rotated_lens(lens, np.pi, Mount.CAMERA_HEAD, axis)
     assert np.degrees(np.arccos(opposite[:3, 2] @ lens[:3, 2])) == pytest.approx(60.0)
 
 
 def test_a_body_on_the_scope_only_sees_the_picture_turn() -> None:
     lens = from_vector([0.2, -0.1, 0.3, 0.01, 0.02, 0.2])
-    assert turned_lens(lens, 0.4, Mount.SCOPE, None) == pytest.approx(lens @ roll(-0.4))
+    assert rotated_lens(lens, 0.4, Mount.SCOPE, None) == pytest.approx(lens @ roll(-0.4))
     with pytest.raises(PerceptionError, match="axis is not calibrated"):
-        turned_lens(lens, 0.4, Mount.CAMERA_HEAD, None)
+        rotated_lens(lens, 0.4, Mount.CAMERA_HEAD, None)
     with pytest.raises(PerceptionError, match="not known"):
-        turned_lens(lens, float("nan"), Mount.SCOPE, None)
+        rotated_lens(lens, float("nan"), Mount.SCOPE, None)
 
 
 def test_a_second_body_tells_axis_and_turn() -> None:
@@ -205,7 +206,7 @@ def test_a_second_body_tells_axis_and_turn() -> None:
     assert found.direction == pytest.approx(axis.direction)
     assert np.cross(found.direction, found.point - axis.point) == pytest.approx(0, abs=1e-9)
     assert spread == pytest.approx(1.5)
-    assert [turn_between(first, pose, found.direction) for pose in poses] == pytest.approx(turns)
+    assert [rotation_between(first, pose, found.direction) for pose in poses] == pytest.approx(turns)
     with pytest.raises(PerceptionError, match="at least 30 deg"):
         shaft_axis(poses[:4])
 

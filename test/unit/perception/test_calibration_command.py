@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.bag_input import STEP_TOPIC, CalibrationBag
+from knee_gap_core.bag.bag import BagMessage, BagReader, BagWriter
+from knee_gap_core.values.rigid_transforms import inverse, to_vector
+from knee_gap_perception.calibrate.bag_input import STEP_TOPIC, CalibrationBag
+from knee_gap_perception.calibrate.command import chosen_steps, main
+from knee_gap_perception.calibrate.recording import Recording, Request
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.calibration.command import chosen_steps, main
-from knee_gap_perception.calibration.recording import Recording, Request
-from knee_gap_perception.calibration.rigid import inverse, to_vector
+from knee_gap_perception.camera.medium import SALINE
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import SALINE
-from knee_gap_replay.bag import BagMessage, BagReader, BagWriter
-from knee_gap_simulation.calibration_bag import CalibrationRecording, calibration_truth, make_calibration_bag
+from knee_gap_simulation.calibration.bag import CalibrationRecording, calibration_truth, make_calibration_bag
 from knee_gap_simulation.rigid import transform
 
 BOARD = "charuco:12x9:3:2"
@@ -266,10 +266,10 @@ def test_a_turned_scope_is_followed(
         assert np.linalg.norm(error[3:]) < 0.2e-3
         assert np.linalg.norm(error[:3]) < np.radians(0.2)
     assert found.oblique is not None
-    assert found.scope_turn(found.oblique.notch_angle + 0.3) == pytest.approx(0.3)
+    assert found.scope_rotation(found.oblique.notch_angle + 0.3) == pytest.approx(0.3)
     if how:
         assert found.oblique.T_head_scope is not None
-        assert found.scope_turn_of_body(found.oblique.T_head_scope) == pytest.approx(0.0, abs=1e-9)
+        assert found.scope_rotation_of_body(found.oblique.T_head_scope) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_board_in_saline_gives_the_camera_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

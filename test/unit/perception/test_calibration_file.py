@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from knee_gap_core.values.rigid_transforms import from_vector, to_vector
+from knee_gap_perception.calibrate.solvers.lens_error import lens_covariance, lens_errors
 from knee_gap_perception.calibration import calibration_file
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
@@ -20,12 +22,10 @@ from knee_gap_perception.calibration.calibration_file import (
     save_calibration,
 )
 from knee_gap_perception.calibration.in_use import CalibrationParameters
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.lens_error import lens_covariance, lens_errors
-from knee_gap_perception.calibration.rigid import from_vector, to_vector
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
+from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.tracking import TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import TrackingParameters
+from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
 
 
 def covariance(size: int, scale: float) -> np.ndarray:  # type: ignore[type-arg]
@@ -71,7 +71,7 @@ def test_parts_may_be_missing(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="calibrate hand_eye"):
         back.body_to_lens()
     with pytest.raises(PerceptionError, match="calibrate oblique"):
-        back.scope_turn(0.1)
+        back.scope_rotation(0.1)
 
 
 def test_the_hash_tells_any_change() -> None:
@@ -246,8 +246,8 @@ def test_the_tracking_node_gets_the_same_lens() -> None:
 
 
 def test_the_notch_tells_the_turn() -> None:
-    assert WHOLE.scope_turn(-0.56 + 0.3) == pytest.approx(0.3)
-    assert WHOLE.scope_turn(np.pi - 0.1) == pytest.approx(np.pi - 0.1 + 0.56 - 2 * np.pi)
+    assert WHOLE.scope_rotation(-0.56 + 0.3) == pytest.approx(0.3)
+    assert WHOLE.scope_rotation(np.pi - 0.1) == pytest.approx(np.pi - 0.1 + 0.56 - 2 * np.pi)
 
 
 def test_pure_travel_does_not_feel_where_the_lens_sits() -> None:

@@ -5,19 +5,20 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.boards import CORNER_BIAS_PX, BoardView
-from knee_gap_perception.calibration.hand_eye import HandEye, HandEyeSettings, calibrate_hand_eye
-from knee_gap_perception.calibration.hand_eye_bundle import HandEyeBundle, HandEyeState, TrackedView
-from knee_gap_perception.calibration.intrinsics import (
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import angle_between, apply, from_vector, inverse, to_vector
+from knee_gap_perception.calibrate.measurements.boards import CORNER_BIAS_PX, BoardView
+from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, HandEyeSettings, calibrate_hand_eye
+from knee_gap_perception.calibrate.solvers.hand_eye_bundle import HandEyeBundle, HandEyeState, TrackedView
+from knee_gap_perception.calibrate.solvers.intrinsics import (
     IntrinsicsFit,
     board_pose,
     design_effect,
     fit_intrinsics,
 )
-from knee_gap_perception.calibration.lens_model import LensModel
-from knee_gap_perception.calibration.rigid import Array, angle_between, apply, from_vector, inverse, to_vector
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turned_lens
+from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis, rotated_lens
 
 SIZE = (1280, 720)
 LENS = np.array([452.0, 453.0, 645.0, 357.0, 0.02, -0.01, 0.0, 0.0])
@@ -49,7 +50,7 @@ def views(seed: int, turns: Sequence[float], tilt: float = 0.45, noise: float = 
         seen = np.linalg.norm(projected - LENS[2:4], axis=1) < 350
         error = np.concatenate([TURN_ERROR * rng.standard_normal(3), SHIFT_ERROR * rng.standard_normal(3)])
         T_world_body = (
-            T_WORLD_BOARD @ T_board_lens @ inverse(turned_lens(T_BODY_LENS, turn, Mount.CAMERA_HEAD, AXIS))
+            T_WORLD_BOARD @ T_board_lens @ inverse(rotated_lens(T_BODY_LENS, turn, Mount.CAMERA_HEAD, AXIS))
         )
         board = BoardView(i, np.flatnonzero(seen), GRID[seen], pixels[seen])
         tracked.append(
@@ -200,8 +201,8 @@ def test_a_turned_scope_and_its_axis_are_found() -> None:
     assert found.axis is not None
     assert np.arccos(found.axis.direction @ AXIS.direction) < np.radians(0.05)
     for turn in (-0.7, 0.0, 0.8):
-        truth = turned_lens(T_BODY_LENS, turn, Mount.CAMERA_HEAD, AXIS)
-        lens = turned_lens(found.T_body_lens, turn, Mount.CAMERA_HEAD, found.axis)
+        truth = rotated_lens(T_BODY_LENS, turn, Mount.CAMERA_HEAD, AXIS)
+        lens = rotated_lens(found.T_body_lens, turn, Mount.CAMERA_HEAD, found.axis)
         assert np.linalg.norm(lens[:3, 3] - truth[:3, 3]) < 0.1e-3
         assert angle_between(lens, truth) < np.radians(0.1)
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.calibration.bearing_errors import BearingErrors
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     Clock,
@@ -17,18 +19,16 @@ from knee_gap_perception.calibration.calibration_file import (
     Oblique,
     save_calibration,
 )
-from knee_gap_perception.calibration.camera_check import disagreement
 from knee_gap_perception.calibration.in_use import CalibrationParameters
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import EdgeStatus
+from knee_gap_perception.camera.agreement import disagreement
+from knee_gap_perception.camera.bearing_errors import BearingErrors
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import fill_scope_calibration
-from knee_gap_perception.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_replay.types import blank
+from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
 from knee_gap_uncertainty.messages import calibration_from_message
 
 CAMERA = Intrinsics(
@@ -64,7 +64,7 @@ def test_the_lens_is_where_the_calibration_says_and_at_the_images_time() -> None
 
 
 def test_a_second_body_turns_the_lens_frame_by_frame() -> None:
-    tracker = ScopeTracker(TrackingParameters(scope_turn_body="post"), calibration=TURNED)
+    tracker = ScopeTracker(TrackingParameters(scope_rotation_body="post"), calibration=TURNED)
     variances = []
     for k in range(20):
         turn = 0.02 * k
@@ -72,7 +72,7 @@ def test_a_second_body_turns_the_lens_frame_by_frame() -> None:
         lens = tracker.update(body(k, T=head), [body(k, "post", head @ AXIS.turned(turn) @ T_HEAD_SCOPE)])
         assert isinstance(lens, LensPose)
         np.testing.assert_allclose(lens.matrix(), head @ TURNED.body_to_lens(turn), atol=1e-9)
-        assert lens.scope_turn == pytest.approx(turn)
+        assert lens.scope_rotation == pytest.approx(turn)
         variances.append(np.trace(lens.covariance))
     # The further the scope is turned, the more the error of the shaft's axis counts.
     chord = 2 * np.sin(0.5 * turn)
@@ -80,7 +80,7 @@ def test_a_second_body_turns_the_lens_frame_by_frame() -> None:
 
 
 def test_without_its_second_body_the_turn_is_not_known() -> None:
-    tracker = ScopeTracker(TrackingParameters(scope_turn_body="post"), calibration=TURNED)
+    tracker = ScopeTracker(TrackingParameters(scope_rotation_body="post"), calibration=TURNED)
     refusal = tracker.update(body(0))
     assert isinstance(refusal, Refusal)
     assert refusal.reason is RefusalReason.NO_TURN
@@ -92,9 +92,9 @@ def test_without_its_second_body_the_turn_is_not_known() -> None:
     [
         ({"body_to_shaft_translation": (0.0, 0.0, 0.2)}, SCOPE, "body_to_shaft_translation: leave one"),
         ({"oblique_angle": 0.1}, SCOPE, "so do oblique_angle"),
-        ({"scope_turn_body": "post"}, None, "needs a calibration_file"),
-        ({"scope_turn_body": "post"}, SCOPE, "knows no second body"),
-        ({}, TURNED, "name it in scope_turn_body"),
+        ({"scope_rotation_body": "post"}, None, "needs a calibration_file"),
+        ({"scope_rotation_body": "post"}, SCOPE, "knows no second body"),
+        ({}, TURNED, "name it in scope_rotation_body"),
         ({}, replace(SCOPE, lens=None), "run calibrate hand_eye"),
     ],
 )
@@ -161,11 +161,11 @@ def test_no_file_means_no_calibration_and_a_missing_one_is_told(tmp_path: Path) 
 
 def test_what_is_told_of_it_arrives_in_the_order_of_rep_103() -> None:
     message = blank("knee_gap_msgs/msg/ScopeCalibration")
-    told = calibration_from_message(fill_scope_calibration(message, "tracking_node", SCOPE))
-    assert told.hash == SCOPE.hash
-    assert told.time_offset_error == 1e-5
-    np.testing.assert_array_equal(np.diag(told.lens_covariance), [4e-8] * 3 + [1e-8] * 3)
-    assert told.error is not None
+    reported = calibration_from_message(fill_scope_calibration(message, "tracking_node", SCOPE))
+    assert reported.hash == SCOPE.hash
+    assert reported.time_offset_error == 1e-5
+    np.testing.assert_array_equal(np.diag(reported.lens_covariance), [4e-8] * 3 + [1e-8] * 3)
+    assert reported.error is not None
     message = blank("knee_gap_msgs/msg/ScopeCalibration")
     nothing = calibration_from_message(fill_scope_calibration(message, "tracking_node", None))
     assert nothing.hash == ""

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_perception.calibration.boards import BoardView
-from knee_gap_perception.calibration.hand_eye import HandEye, calibrate_hand_eye
-from knee_gap_perception.calibration.hand_eye_bundle import TrackedView
-from knee_gap_perception.calibration.intrinsics import fit_intrinsics
-from knee_gap_perception.calibration.lens_error import lens_errors
-from knee_gap_perception.calibration.lens_model import LensModel
-from knee_gap_perception.calibration.pivot import calibrate_pivot
-from knee_gap_perception.calibration.rigid import Array
+from knee_gap_core.values.arrays import Array
+from knee_gap_perception.calibrate.measurements.boards import BoardView
+from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, calibrate_hand_eye
+from knee_gap_perception.calibrate.solvers.hand_eye_bundle import TrackedView
+from knee_gap_perception.calibrate.solvers.intrinsics import fit_intrinsics
+from knee_gap_perception.calibrate.solvers.lens_error import lens_errors
+from knee_gap_perception.calibrate.solvers.pivot import calibrate_pivot
+from knee_gap_perception.camera.projection import LensModel
 from knee_gap_uncertainty.errors import MeasurementError
-from knee_gap_uncertainty.gap_range import gap_range
+from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "images" / "tracked_laparoscope"
 SESSION = DATA / "session_15-04-12"

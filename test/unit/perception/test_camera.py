@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.camera import (
+from knee_gap_perception.camera.models import (
     Camera,
     EquiangularCamera,
     FisheyeCamera,

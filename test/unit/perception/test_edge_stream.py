@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.edge_stream import MOST_WAITING, EdgeStream
-from knee_gap_perception.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.edges import EdgeStatus, GapEdges
+from knee_gap_perception.camera.medium import AIR
+from knee_gap_perception.edge_tracking.edge_stream import MOST_WAITING, EdgeStream
+from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import AIR
-from knee_gap_perception.segmentation_parameters import PoseParameters
 
 FRAME_NS = 33_333_333
 POSE_NS = 8_333_333

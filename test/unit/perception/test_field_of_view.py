@@ -5,12 +5,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder, find_field_of_view
-
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Image
+from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, find_field_of_view
 
 
 def disc(

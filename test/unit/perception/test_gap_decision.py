@@ -4,17 +4,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.border_sharpness import border_sharpness
-from knee_gap_perception.camera import FisheyeCamera
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeStatus
-from knee_gap_perception.field_of_view import FieldOfView, FieldOfViewFinder
-from knee_gap_perception.gap_evidence import SPAN, GapEvidence
-
-Image = npt.NDArray[np.uint8]
+from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import FisheyeCamera
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.gap_detection.border_sharpness import border_sharpness
+from knee_gap_perception.gap_detection.confidence_filter import SPAN, ConfidenceFilter
+from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder
 
 WIDTH, HEIGHT, RADIUS = 1280, 720, 355
 CAMERA = FisheyeCamera(WIDTH, HEIGHT, 458.4, 458.4, WIDTH / 2, HEIGHT / 2)
@@ -43,7 +41,7 @@ def field_of(image: Image) -> FieldOfView:
 
 
 def decided(image: Image) -> tuple[EdgeStatus, float]:
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     return detector.process(0, image, CAMERA).status, detector.confidence
 
 
@@ -85,11 +83,11 @@ def test_sharpness_is_told_for_either_side(side: int) -> None:
 
 def test_one_image_decides_by_itself() -> None:
     for confidence in (0.0, 0.3, 0.51, 1.0):
-        assert GapEvidence().add(0, confidence) == confidence
+        assert ConfidenceFilter().add(0, confidence) == confidence
 
 
 def test_images_of_the_last_moment_are_heard_alike() -> None:
-    evidence = GapEvidence()
+    evidence = ConfidenceFilter()
     for stamp in (0, FRAME_NS):
         evidence.add(stamp, 0.2)
     # Log odds -1.386 twice and +1.386 once.
@@ -98,7 +96,7 @@ def test_images_of_the_last_moment_are_heard_alike() -> None:
 
 
 def test_as_many_sure_images_as_were_against_it_turn_the_evidence() -> None:
-    evidence = GapEvidence()
+    evidence = ConfidenceFilter()
     for index in range(3):
         evidence.add(index * FRAME_NS, 0.0)
     heard = [evidence.add((3 + index) * FRAME_NS, 1.0) for index in range(3)]
@@ -106,14 +104,14 @@ def test_as_many_sure_images_as_were_against_it_turn_the_evidence() -> None:
 
 
 def test_evidence_of_another_recording_is_not_heard() -> None:
-    evidence = GapEvidence()
+    evidence = ConfidenceFilter()
     evidence.add(1_000_000_000, 0.0)
     assert evidence.add(990_000_000, 0.9) == 0.9
 
 
 def test_after_images_without_a_gap_a_track_begins_late_but_soon(joint: Any) -> None:
     crease, gap = banded(280.0, 280.0, gap=4.0), [joint.picture(np.eye(4), seed) for seed in range(6)]
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     stamps = iter(range(0, 60 * FRAME_NS, FRAME_NS))
     for _ in range(2):
         assert detector.process(next(stamps), crease, joint.camera).status is EdgeStatus.NO_GAP
@@ -127,7 +125,7 @@ def test_after_images_without_a_gap_a_track_begins_late_but_soon(joint: Any) -> 
 
 def test_a_click_asks_no_image_before(joint: Any) -> None:
     crease, gap = banded(280.0, 280.0, gap=4.0), joint.picture(np.eye(4), 0)
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     for index in range(2):
         detector.process(index * FRAME_NS, crease, joint.camera)
     detector.choose_at([WIDTH / 2, HEIGHT / 2])

@@ -4,14 +4,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.calibration.bearing_errors import BearingErrors
+from knee_gap_core.values.arrays import Array
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration, save_calibration
 from knee_gap_perception.calibration.in_use import CalibrationParameters
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.camera import (
+from knee_gap_perception.camera.bearing_errors import BearingErrors
+from knee_gap_perception.camera.camera_errors import MOST_ERRORS, NEAR, PUPIL_DEPTH, CameraErrors, pupil_shift
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.camera.medium import AIR, SALINE, WATER, Medium, medium_of
+from knee_gap_perception.camera.models import (
     Camera,
     EquiangularCamera,
     FisheyeCamera,
@@ -21,13 +23,10 @@ from knee_gap_perception.camera import (
     camera_from_info,
     camera_in_medium,
 )
-from knee_gap_perception.camera_errors import MOST_ERRORS, NEAR, PUPIL_DEPTH, CameraErrors, pupil_shift
-from knee_gap_perception.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.parameters import CameraInfoParameters
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import AIR, SALINE, WATER, Medium, medium_of
-from knee_gap_perception.segmentation_parameters import CameraInfoParameters
 
-Array = npt.NDArray[np.float64]
 GLASS = 1.77  # a window of sapphire
 BARREL = (-0.15, 0.02, 0.001, -0.0008, -0.001)
 CAMERAS: dict[str, Camera] = {
@@ -174,8 +173,8 @@ def test_errors_of_the_cameras_numbers_go_through_the_window() -> None:
     class One:
         """The camera's errors alone, few enough to be told one by one."""
 
-        def of(self, told: Array) -> Array:
-            return source.of(told)[..., :3]
+        def of(self, reported: Array) -> Array:
+            return source.of(reported)[..., :3]
 
     columns = CameraErrors(camera, [One()], AIR, SALINE).of(bearings)
     before = source.of(camera.bearings(pixels))[..., :3]

@@ -7,11 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import fill_gap_edges, image_from_compressed, image_from_message, stamp_ns
-
-Image = npt.NDArray[np.uint8]
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.optitrack.body_source import UnknownBodyError
-from knee_gap_perception.optitrack.motive_csv import TakeError, _start_time, read_take
+from knee_gap_perception.trackers.body_source import UnknownBodyError
+from knee_gap_perception.trackers.motive_csv import TakeError, _start_time, read_take
 
 TAKES = Path(__file__).resolve().parents[4] / "shared" / "data" / "optitrack" / "motive_csv"
 

@@ -9,8 +9,8 @@ from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
 
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.natnet_buffer import PacketError
-from knee_gap_perception.optitrack.natnet_packets import (
+from knee_gap_perception.trackers.natnet.buffer import PacketError
+from knee_gap_perception.trackers.natnet.packets import (
     EchoResponse,
     Frame,
     ModelDefinitions,
@@ -20,7 +20,7 @@ from knee_gap_perception.optitrack.natnet_packets import (
     decode_packet,
     echo_request,
 )
-from knee_gap_simulation import natnet_server_packets as server
+from knee_gap_simulation.natnet import packets as server
 
 CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "data" / "optitrack"
 V3 = NatNetVersion(3, 0)

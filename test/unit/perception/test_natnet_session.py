@@ -4,11 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_perception.optitrack.body_source import UnknownBodyError, choose_body
-from knee_gap_perception.optitrack.natnet_clock import EchoClock
-from knee_gap_perception.optitrack.natnet_packets import MessageId
-from knee_gap_perception.optitrack.natnet_session import NatNetSession
-from knee_gap_simulation import natnet_server_packets as server
+from knee_gap_perception.trackers.body_source import UnknownBodyError, choose_body
+from knee_gap_perception.trackers.natnet.clock import EchoClock
+from knee_gap_perception.trackers.natnet.packets import MessageId
+from knee_gap_perception.trackers.natnet.session import NatNetSession
+from knee_gap_simulation.natnet import packets as server
 
 CAPTURE = Path(__file__).resolve().parents[4] / "shared/data/optitrack/natnet_v3/traffic_first_half.pcapng"
 MOTIVE = ("10.0.0.5", 1510)

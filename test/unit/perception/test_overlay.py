@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knee_gap_perception.edge_detector import GapEdgeDetector
-from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
-from knee_gap_perception.overlay import draw_overlay, words
+from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.edge_tracking.overlay import draw_overlay, words
 
 
 def test_points_are_marked_and_the_image_is_left_alone(joint: Any, travel: Any) -> None:
     image = travel[1][0]
-    detector = GapEdgeDetector()
+    detector = GapEdgeTracker()
     edges = detector.process(0, image, joint.camera)
     before = image.copy()
     drawn = draw_overlay(image, edges, detector.gap_mask(), detector.reason, joint.camera)
@@ -26,7 +26,7 @@ def test_points_are_marked_and_the_image_is_left_alone(joint: Any, travel: Any) 
 
 def test_a_larger_error_is_drawn_larger(joint: Any, travel: Any) -> None:
     image = travel[1][0]
-    edges = GapEdgeDetector().process(0, image, joint.camera)
+    edges = GapEdgeTracker().process(0, image, joint.camera)
     empty = np.zeros((0, 0), np.uint8)
     small = draw_overlay(image, edges, empty, "", joint.camera) != image
     large = (
@@ -55,7 +55,7 @@ def test_every_status_has_words(status: EdgeStatus) -> None:
 
 def test_kinds_are_named(joint: Any, travel: Any) -> None:
     image = travel[1][0]
-    edges = GapEdgeDetector().process(0, image, joint.camera)
+    edges = GapEdgeTracker().process(0, image, joint.camera)
     empty = np.zeros((0, 0), np.uint8)
     rim, contour = (
         draw_overlay(image, replace(edges, kinds=(kind, kind)), empty, "")

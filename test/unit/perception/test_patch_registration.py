@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.patch_registration import Patch, Warp, surface_around
-from knee_gap_perception.point_track import REGISTRATION_FLOOR
+from knee_gap_perception.point_tracking.patch_registration import Patch, Warp, surface_around
+from knee_gap_perception.point_tracking.point_tracker import REGISTRATION_FLOOR
 
 HALF, CENTRE = 32, np.array([128.0, 128.0])
 WIDE_PRIOR = np.diag([16.0, 16.0, 1e-4, 1e-4, 1e-4, 1e-4])

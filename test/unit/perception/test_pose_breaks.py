@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.messages_tracking import fill_lens_pose
-from knee_gap_perception.point_track import PointTrack
-from knee_gap_perception.pose_validity import RefusalReason, ValidityParameters
-from knee_gap_perception.poses import BodyPose, LensPose
-from knee_gap_perception.segmentation_parameters import PoseParameters
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_perception.point_tracking.point_tracker import PointTracker
+from knee_gap_perception.scope_pose.pose_validity import RefusalReason, ValidityParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 
 FRAME = 0.05  # [s] between images
 PERIOD = 1 / 120
@@ -85,11 +85,11 @@ class Chain:
         for t in times:
             place = lens(t) + offset + rng.normal(0, 2e-5, 3)
             body = BodyPose(BEGIN_NS + round(1e9 * (t + step)), place, np.array([0.0, 0.0, 0.0, 1.0]))
-            for told in self.tracker.take(body):
-                if isinstance(told, LensPose):
-                    self.stream.on_lens_pose(fill_lens_pose(pose(np.zeros(3), 0.0), told))
+            for reported in self.tracker.take(body):
+                if isinstance(reported, LensPose):
+                    self.stream.on_lens_pose(fill_lens_pose(pose(np.zeros(3), 0.0), reported))
                 else:
-                    self.refused.append(told.reason)
+                    self.refused.append(reported.reason)
 
     def image(self, picture: np.ndarray, t: float) -> GapEdges:
         self.stream.on_image(image(picture, t))
@@ -161,11 +161,11 @@ def test_each_patch_is_looked_for_where_it_is_predicted(
     grey = [np.ascontiguousarray(picture[:, :, 1]) for picture in pictures]
     pixel = np.array([660.0, 210.0])
     for away in (30.0, -30.0, 60.0, -100.0, 1e5):
-        point = PointTrack(grey[0], pixel, 20.0, joint.camera, None)
+        point = PointTracker(grey[0], pixel, 20.0, joint.camera, None)
         taken = [point.follow(picture, joint.camera, None) for picture in grey[1:4]]
         assert taken[-1].seen
         # A second patch, as is taken once the first one looks too different.
-        point._anchors.append(PointTrack(grey[3], taken[-1].position, 20.0, joint.camera, None)._anchors[0])
+        point._anchors.append(PointTracker(grey[3], taken[-1].position, 20.0, joint.camera, None)._anchors[0])
         predict = point._predict
 
         def astray(index: int, *rest: Any, predict: Any = predict, away: float = away) -> Any:

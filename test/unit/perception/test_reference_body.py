@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_perception.reference_body import relative_to
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
+from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
+from knee_gap_perception.scope_pose.reference_body import relative_to
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 
 PERIOD_NS = 8_333_333
 START_NS = 1_700_000_000_000_000_000

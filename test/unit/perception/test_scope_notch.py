@@ -7,6 +7,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
+from knee_gap_core.values.rigid_transforms import to_vector
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     LensOnBody,
@@ -14,29 +17,26 @@ from knee_gap_perception.calibration.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.notch import Notch, NotchShape, common_shape, find_notch
-from knee_gap_perception.calibration.rigid import to_vector
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis
-from knee_gap_perception.edge_stream import EdgeStream
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.field_of_view import FieldOfView
-from knee_gap_perception.messages_tracking import fill_scope_notch, fill_scope_turn, notch_from_message
-from knee_gap_perception.notch_follower import (
+from knee_gap_perception.image.field_of_view import FieldOfView
+from knee_gap_perception.messages_tracking import fill_scope_notch, fill_scope_rotation, notch_from_message
+from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
+from knee_gap_perception.scope_pose.scope_tracker import NO_NOTCH_YET, ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_rotation.notch import Notch, NotchShape, common_shape, find_notch
+from knee_gap_perception.scope_rotation.notch_tracker import (
     FAR_AWAY,
     NO_FIELD,
     NO_NOTCH,
     NOT_SURE,
     SEVERAL,
     NotchFollower,
-    NotchSight,
+    NotchObservation,
 )
-from knee_gap_perception.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_perception.tracking import NO_NOTCH_YET, ScopeTracker, TrackingParameters
-from knee_gap_perception.turned_poses import NO_POSES
-from knee_gap_replay.types import blank
-from knee_gap_uncertainty.messages import turn_from_message
+from knee_gap_perception.scope_rotation.rotated_poses import NO_POSES
+from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
+from knee_gap_uncertainty.messages import rotation_from_message
 
 SHAPE = NotchShape(0.047, 0.0597)
 HEIGHT, WIDTH = 360, 640
@@ -78,21 +78,21 @@ def wrapped(angle: float) -> float:
 
 
 def test_a_notch_that_turns_through_the_gap_is_right_wherever_it_is_told() -> None:
-    follower, told, hidden = NotchFollower(SHAPE), [], 0
+    follower, reported, hidden = NotchFollower(SHAPE), [], 0
     for index in range(120):
         angle = -2.6 + 0.05 * index
-        sight = follower.look(stamp(index), picture(angle, gap=(-0.25, 0.2), seed=index))
+        observation = follower.look(stamp(index), picture(angle, gap=(-0.25, 0.2), seed=index))
         row = np.sin(angle)
-        hidden += bool(-0.2 < row < 0.15 and not sight.seen)
-        if sight.seen:
-            told.append(np.degrees(wrapped(sight.angle - angle)))
+        hidden += bool(-0.2 < row < 0.15 and not observation.seen)
+        if observation.seen:
+            reported.append(np.degrees(wrapped(observation.angle - angle)))
         else:
-            assert np.isnan(sight.angle)
+            assert np.isnan(observation.angle)
     # Where the gap reaches the border it does not show, and nothing is said.
     assert hidden > 5
-    assert len(told) > 85
-    assert np.abs(told).max() < 0.5
-    assert np.sqrt(np.mean(np.square(told))) < 0.15
+    assert len(reported) > 85
+    assert np.abs(reported).max() < 0.5
+    assert np.sqrt(np.mean(np.square(reported))) < 0.15
 
 
 def test_a_gap_at_the_border_is_no_notch() -> None:
@@ -102,9 +102,9 @@ def test_a_gap_at_the_border_is_no_notch() -> None:
         middle, width = np.linspace(-0.8, 0.8, 60)[index], (0.06, 0.12, 0.2, 0.4)[index % 4]
         for image in range(4):
             edges = (middle - width / 2 + 0.002 * image, middle + width / 2)
-            sight = follower.look(stamp(image), picture(gap=edges, seed=4 * index + image))
-            assert not sight.seen
-            assert sight.reason in (NO_NOTCH, NO_FIELD, NOT_SURE, SEVERAL)
+            observation = follower.look(stamp(image), picture(gap=edges, seed=4 * index + image))
+            assert not observation.seen
+            assert observation.reason in (NO_NOTCH, NO_FIELD, NOT_SURE, SEVERAL)
 
 
 def test_a_first_sight_counts_when_it_is_confirmed() -> None:
@@ -169,12 +169,12 @@ def body(time: float) -> BodyPose:
     return BodyPose(START_NS + round(time * 1e9), head(time)[:3, 3], quaternion, "scope")
 
 
-def sight(time: float, turn: float, reason: str = "") -> NotchSight:
+def observation(time: float, turn: float, reason: str = "") -> NotchObservation:
     unknown = float("nan")
     stamp_ns = START_NS + round(time * 1e9)
     if reason:
-        return NotchSight(stamp_ns, unknown, unknown, reason)
-    return NotchSight(stamp_ns, wrapped(0.3 + turn), 1e-3)
+        return NotchObservation(stamp_ns, unknown, unknown, reason)
+    return NotchObservation(stamp_ns, wrapped(0.3 + turn), 1e-3)
 
 
 def test_there_is_one_pose_an_image_turned_as_its_notch_says() -> None:
@@ -184,7 +184,7 @@ def test_there_is_one_pose_an_image_turned_as_its_notch_says() -> None:
         time = k / 120
         if k % 4 == 2:
             # It comes before the tracked pose that follows it, and again in the other order.
-            found += tracker.take_notch(sight(time - 0.004, 0.5 * (time - 0.004)))
+            found += tracker.take_notch(observation(time - 0.004, 0.5 * (time - 0.004)))
         found += tracker.take(body(time))
     poses = [pose for pose in found if isinstance(pose, LensPose)]
     assert len(poses) == len(found) == 15
@@ -194,12 +194,12 @@ def test_there_is_one_pose_an_image_turned_as_its_notch_says() -> None:
         error = to_vector(np.linalg.inv(expected) @ pose.matrix())
         assert np.linalg.norm(error[3:]) < 2e-6
         assert np.linalg.norm(error[:3]) < 2e-5
-        message = fill_scope_turn(blank("knee_gap_msgs/msg/ScopeTurn"), pose)
-        told = turn_from_message(message)
-        assert told.stamp_ns == pose.stamp_ns
-        assert told.turn == pytest.approx(0.5 * time)
+        message = fill_scope_rotation(blank("knee_gap_msgs/msg/ScopeRotation"), pose)
+        reported = rotation_from_message(message)
+        assert reported.stamp_ns == pose.stamp_ns
+        assert reported.turn == pytest.approx(0.5 * time)
         assert message.header.frame_id == pose.child_frame_id
-    assert tracker.follows_turn
+    assert tracker.follows_rotation
     assert tracker.notch_flaw == ""
     assert tracker.accepted_count == 15
 
@@ -208,14 +208,16 @@ def test_an_image_without_its_notch_or_without_poses_has_no_pose() -> None:
     tracker = ScopeTracker(calibration=SCOPE, by_notch=True)
     for k in range(12):
         assert tracker.take(body(k / 120)) == []
-    (refused,) = tracker.take_notch(sight(0.05, 0.1, NO_NOTCH))
+    (refused,) = tracker.take_notch(observation(0.05, 0.1, NO_NOTCH))
     assert isinstance(refused, Refusal)
     assert (refused.reason, refused.detail) == (RefusalReason.NO_TURN, NO_NOTCH)
     assert tracker.notch_flaw == NO_NOTCH
     # The tracker is away around the next image.
-    assert tracker.take_notch(sight(0.2, 0.1)) == []
+    assert tracker.take_notch(observation(0.2, 0.1)) == []
     late = [tracker.take(body(k / 120)) for k in range(40, 44)]
-    (refused,) = [one for told in late for one in told if isinstance(one, Refusal) and one.detail == NO_POSES]
+    (refused,) = [
+        one for reported in late for one in reported if isinstance(one, Refusal) and one.detail == NO_POSES
+    ]
     assert tracker.accepted_count == 0
 
 
@@ -226,7 +228,7 @@ def test_a_turn_that_is_not_known_well_is_felt_in_the_covariance() -> None:
     tracker.take(body(0.1))
 
     def at(turn: float, error: float) -> LensPose:
-        (pose,) = tracker.take_notch(NotchSight(body(0.1).stamp_ns, wrapped(0.3 + turn), error))
+        (pose,) = tracker.take_notch(NotchObservation(body(0.1).stamp_ns, wrapped(0.3 + turn), error))
         assert isinstance(pose, LensPose)
         return pose
 
@@ -248,7 +250,7 @@ def test_a_turn_that_is_not_known_well_is_felt_in_the_covariance() -> None:
     ("parameters", "calibration", "words"),
     [
         ({}, None, "needs a calibration_file of calibrate oblique"),
-        ({"scope_turn_body": "post"}, SCOPE, "leave one of them out"),
+        ({"scope_rotation_body": "post"}, SCOPE, "leave one of them out"),
         ({}, replace(SCOPE, oblique=None), "does not know the notch"),
         ({}, replace(SCOPE, oblique=Oblique(0.3, AXIS, 5e-4, 4e-5)), "does not know the notch"),
         (
@@ -275,8 +277,8 @@ def image(index: int, pixels: npt.NDArray[np.uint8]) -> Any:
 
 def test_the_stream_says_at_once_where_the_notch_is_and_waits_for_its_pose_only() -> None:
     stream = EdgeStream(calibration=SCOPE, by_notch=True)
-    sights = [stream.on_image(image(k, picture(0.4, seed=k)), stamp(k)) for k in range(3)]
-    assert [one.seen for one in sights if one is not None] == [False, False, True]
+    observations = [stream.on_image(image(k, picture(0.4, seed=k)), stamp(k)) for k in range(3)]
+    assert [one.seen for one in observations if one is not None] == [False, False, True]
     assert stream.counts["the notch is seen"] == 1
     small = stream.on_image(image(3, picture(0.4)[:100, :200]), stamp(3))
     assert small is not None
@@ -287,11 +289,11 @@ def test_the_stream_says_at_once_where_the_notch_is_and_waits_for_its_pose_only(
 
 
 def test_a_sight_survives_its_message_and_numbers_that_are_none_are_no_sight() -> None:
-    message = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), sight(1.0, 0.2), "lens")
-    assert notch_from_message(message) == sight(1.0, 0.2)
+    message = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), observation(1.0, 0.2), "lens")
+    assert notch_from_message(message) == observation(1.0, 0.2)
     message.angle = float("inf")
     assert "must be finite" in notch_from_message(message).reason
-    unseen = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), sight(1.0, 0.2, NO_NOTCH), "lens")
+    unseen = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), observation(1.0, 0.2, NO_NOTCH), "lens")
     assert notch_from_message(unseen).reason == NO_NOTCH
     assert np.isnan(unseen.angle)
 

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.camera import FisheyeCamera
-from knee_gap_perception.edges import EdgeState
-from knee_gap_perception.field_of_view import FieldOfView
-from knee_gap_perception.section_edges import SectionEdgeFinder, largest_circle
+from knee_gap_core.values.edges import EdgeState
+from knee_gap_perception.camera.models import FisheyeCamera
+from knee_gap_perception.gap_detection.section_edges import SectionEdgeFinder, largest_circle
+from knee_gap_perception.image.field_of_view import FieldOfView
 
 CAMERA = FisheyeCamera(1280, 720, 640.0, 640.0, 639.5, 359.5)
 FIELD = FieldOfView((639.5, 359.5), 355.0, (-0.5, -0.5, 1279.5, 719.5))

@@ -8,14 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.three_classes import otsu3
 from knee_gap_perception.segmentation.thresholds import otsu_threshold
-
-Image = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.tissue_texture import TissueTexture
+from knee_gap_perception.point_tracking.texture import TissueTexture
 
 CENTRE, HALF = np.array([128.0, 128.0]), 24
 

@@ -7,8 +7,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.tracker_precision import PoseSeries, pooled, tracker_precision
-from knee_gap_perception.tracker_precision_command import main
+from knee_gap_perception.tracker_precision.command import main
+from knee_gap_perception.tracker_precision.precision import PoseSeries, pooled, tracker_precision
 
 RATE = 120.0
 DT, OMEGA = 0.0367e-3, radians(0.004)
@@ -169,7 +169,7 @@ class TestCommand:
     def test_what_it_prints_is_taken_by_the_tracker(self, tmp_path):
         from ruamel.yaml import YAML
 
-        from knee_gap_perception.tracking import TrackingParameters
+        from knee_gap_perception.scope_pose.scope_tracker import TrackingParameters
 
         write_bag(tmp_path / "bag", recording(1, rest=2.0, motion=3.0))
         assert main([str(tmp_path / "bag"), "--out", str(tmp_path), "--lever", "0", "0", "0.2"]) == 0

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import (
     body_pose_from_message,
     fill_lens_pose,
     fill_lens_transform,
 )
-from knee_gap_perception.pose_validity import Refusal, RefusalReason, ValidityParameters
-from knee_gap_perception.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason, ValidityParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 
 PERIOD_NS = 8_333_333
 START_NS = 1_700_000_000_000_000_000
@@ -412,7 +412,7 @@ def test_messages_carry_the_pose_there_and_back():
 
 
 def test_angles_between_poses_are_exact_near_zero_and_near_a_half_turn():
-    from knee_gap_perception.pose_validity import distance_and_angle
+    from knee_gap_perception.scope_pose.pose_validity import distance_and_angle
 
     start = hand_motion(0)
     for angle in (1e-9, 1e-4, 1.0, pi - 1e-6):

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.up_axis import position_z_up, quaternion_z_up
+from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 
 rng = np.random.default_rng(8)
 

@@ -1,7 +1,7 @@
 """After warming up nothing is compiled any more."""
 
-from knee_gap_perception import patch_kernel
-from knee_gap_perception.edges import EdgeStatus
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.point_tracking import patch_kernel
 from knee_gap_perception.warm_up import warm_up
 
 

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_perception import tracker_precision_command
-from knee_gap_perception.calibration import command as calibrate
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import blank
+from knee_gap_perception.calibrate import command as calibrate
 from knee_gap_perception.calibration.calibration_file import (
     Calibration,
     Clock,
@@ -21,13 +23,11 @@ from knee_gap_perception.calibration.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from knee_gap_perception.calibration.scope_turn import Mount
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.motive_csv import read_take
+from knee_gap_perception.scope_rotation.shaft_axis import Mount
+from knee_gap_perception.tracker_precision import command as tracker_precision_command
+from knee_gap_perception.trackers.motive_csv import read_take
 from knee_gap_replay import check, import_motive, process
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.errors import BagError
-from knee_gap_replay.types import blank
 
 IMAGE, INFO, POSE = "/knee_gap/image_raw/compressed", "/knee_gap/camera_info", "/knee_gap/scope_body/pose"
 SCOPE = (

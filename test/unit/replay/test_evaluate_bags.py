@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.evaluate import main
-from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
+from knee_gap_replay.evaluation.command import main
 from knee_gap_replay.process import main as process
-from knee_gap_replay.types import blank
 from knee_gap_simulation.make_bag import Recording, make_bag
 
 MASK, TRUTH = "/knee_gap/gap_mask", "/knee_gap/gap_mask_true"

@@ -6,24 +6,23 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_perception.edge_stream import EdgeStream
-from knee_gap_perception.edges import EdgeKind, EdgeStatus, GapEdges
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import Output, process
 from knee_gap_replay.topics import InputTopics
-from knee_gap_replay.types import blank
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
-Array = npt.NDArray[np.float64]
 
 TOPICS = InputTopics("/image", "/camera_info", "/body")
 POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
@@ -294,9 +293,9 @@ def test_what_raises_is_refused_and_the_run_goes_on(faulty: str, monkeypatch: py
     # Every image is answered, refused or not; what the estimator never took in is silence.
     assert len(on(outputs, "/space/gap_edges")) == 60
     assert len(on(outputs, "/space/gap")) >= (54 if faulty == "estimator" else 60)
-    (told,) = (flaw for flaw in pipeline.flaws() if "refused" in flaw)
+    (reported,) = (flaw for flaw in pipeline.flaws() if "refused" in flaw)
     kind = "IndexError" if faulty == "segmentation" else "ArithmeticError"
-    assert f"refused: {kind} in " in told
+    assert f"refused: {kind} in " in reported
     if faulty == "segmentation":
         assert len(edges.reasons) == 6
         assert len(set(edges.reasons)) == 1

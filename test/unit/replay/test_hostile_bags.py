@@ -15,10 +15,10 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, Schema
 
-from knee_gap_node.bag import mcap_chunk, mcap_file
-from knee_gap_node.bag.bag import BagReader, BagWriter
-from knee_gap_node.bag.errors import BagError
-from knee_gap_node.bag.types import blank
+from knee_gap_core.bag import mcap_chunk, mcap_file
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import blank
 
 MAGIC = b"\x89MCAP0\r\n"
 MSGTYPE = "std_msgs/msg/String"
@@ -286,7 +286,7 @@ def test_a_bomb_is_read_in_bounded_memory(tmp_path: Path) -> None:
     path = mcap(tmp_path / "bombs.mcap", *bombs)
     program = (
         "import resource, sys\n"
-        "from knee_gap_node.bag.bag import BagReader\n"
+        "from knee_gap_core.bag.bag import BagReader\n"
         "with BagReader(sys.argv[1]) as reader:\n"
         "    list(reader.messages())\n"
         "    print(len(reader.losses), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"

@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_replay.bag import BagReader, BagWriter
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
 from knee_gap_replay.import_motive import main
-from knee_gap_replay.types import blank
 
 TAKE = Path(__file__).resolve().parents[4] / "shared/data/optitrack/motive_csv/pathviewr_v123_quat_m_3rb.csv"
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from knee_gap_replay.bag import BagMessage
+from knee_gap_core.bag.bag import BagMessage
 from knee_gap_replay.playback import Event, Pace, play_once, with_clock, without_clock
 
 PERIOD_NS = 16_666_667

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.errors import BagError
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.bag.qos import QosName
 from knee_gap_replay.processing import Output, by_stamp, process
-from knee_gap_replay.qos import QosName
-from knee_gap_replay.types import blank
 
 POSE = "geometry_msgs/msg/PoseStamped"
 

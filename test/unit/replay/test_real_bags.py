@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from knee_gap_replay.bag import BagReader
-from knee_gap_replay.errors import BagError
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.bag.errors import BagError
 
 BAGS = Path(__file__).parents[4] / "shared/data/mcap/rosbag2"
 

@@ -7,7 +7,7 @@ from typing import cast
 import pytest
 from rosbags.interfaces import Qos
 
-from knee_gap_replay.bag import BagMessage, BagReader, BagWriter
+from knee_gap_core.bag.bag import BagMessage, BagReader, BagWriter
 from knee_gap_replay.recording import WriterThread
 
 TYPE = "std_msgs/msg/Float64"

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from knee_gap_replay import check, command_line, process, processing
-from knee_gap_replay.bag import BagReader, BagWriter
-from knee_gap_replay.types import blank
+from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.message_types import blank
+from knee_gap_core.node import command_line
+from knee_gap_replay import check, process, processing
 
 IMAGE, INFO, POSE = "/knee_gap/image_raw/compressed", "/knee_gap/camera_info", "/knee_gap/scope_body/pose"
 
@@ -30,7 +31,7 @@ def write(path: Path, *, pose_from_ms: int = 0, skip: str = "") -> Path:
     return path
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> str:
+def reported(capsys: pytest.CaptureFixture[str]) -> str:
     """Return the one line on stderr."""
     error = capsys.readouterr().err
     assert error.count("\n") == 1, error
@@ -59,25 +60,25 @@ def test_process_refuses_mistakes_in_one_line(tmp_path: Path, capsys: pytest.Cap
     poor = str(write(tmp_path / "poor", skip=INFO))
     out = str(tmp_path / "out")
     assert process.main([str(tmp_path / "nothing"), out]) == 1
-    assert "does not exist" in told(capsys)
+    assert "does not exist" in reported(capsys)
     (Path(poor) / "scope.yaml").write_text(SCOPE)
     assert process.main([poor, out]) == 1
-    assert f"has no topic {INFO}; it has " in told(capsys)
+    assert f"has no topic {INFO}; it has " in reported(capsys)
     assert process.main([bag, out]) == 1
-    assert "where the lens sits on the tracked body is not known" in told(capsys)
+    assert "where the lens sits on the tracked body is not known" in reported(capsys)
     (Path(bag) / "scope.yaml").write_text(SCOPE)
     assert process.main([bag, bag]) == 1
-    assert "exists already" in told(capsys)
+    assert "exists already" in reported(capsys)
     assert process.main([bag, out, "--pose", "/other"]) == 1
-    assert "has no topic /other" in told(capsys)
+    assert "has no topic /other" in reported(capsys)
     parameters = tmp_path / "params.yaml"
     parameters.write_text("tracking_node:\n  ros__parameters:\n    oblique_angel: 0.5\n")
     assert process.main([bag, out, "--params-file", str(parameters)]) == 1
-    assert "no parameter oblique_angel of tracking_node" in told(capsys)
+    assert "no parameter oblique_angel of tracking_node" in reported(capsys)
     assert not Path(out).exists()
     with pytest.raises(SystemExit, match="2"):
         process.main([bag])
-    assert "required: OUT" in told(capsys)
+    assert "required: OUT" in reported(capsys)
 
 
 def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,7 +115,7 @@ def test_check_tells_damage_and_judges_by_what_is_left(
 def test_check_refuses_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "x.mcap").write_text("not a bag, but long enough to look at")
     assert check.main([str(tmp_path / "x.mcap")]) == 1
-    assert "is not an MCAP file" in told(capsys)
+    assert "is not an MCAP file" in reported(capsys)
 
 
 def test_process_that_is_ended_leaves_a_bag_that_opens(
@@ -134,7 +135,7 @@ def test_process_that_is_ended_leaves_a_bag_that_opens(
         assert process.main([str(bag), str(out)]) == 130
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert told(capsys) == "process: stopped before the end\n"
+    assert reported(capsys) == "process: stopped before the end\n"
     with BagReader(out) as reader:
         assert len(list(reader.messages(["/knee_gap/gap_edges"]))) == 50
         assert not reader.losses

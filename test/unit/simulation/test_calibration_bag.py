@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.calibration_bag import (
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_simulation.calibration.bag import (
     CalibrationMotion,
     CalibrationRecording,
     calibration_truth,
     make_calibration_bag,
 )
-from knee_gap_simulation.calibration_scene import BoardCamera, TurnedScope
+from knee_gap_simulation.calibration.scene import BoardCamera, RotatedScope
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.make_bag import main
 from knee_gap_simulation.rigid import inverse
@@ -41,7 +41,7 @@ def test_corners_are_drawn_where_the_truth_says() -> None:
 
 
 def test_a_turn_moves_the_view_around_the_shaft_and_the_notch_with_the_picture() -> None:
-    scope = TurnedScope()
+    scope = RotatedScope()
     shaft = scope.scope.body_to_shaft()
     lenses = [scope.body_to_lens(turn) for turn in (0.0, 0.6)]
     for lens in lenses:
@@ -64,10 +64,10 @@ def test_a_bag_carries_its_truth_and_is_the_same_again(tmp_path: Path) -> None:
     for name in ("one", "two"):
         with BagReader(tmp_path / name) as reader:
             bags.append([(m.topic, m.time_ns, m.data) for m in reader.messages()])
-            told = json.loads(reader.metadata["knee_gap_calibration_truth"])
+            reported = json.loads(reader.metadata["knee_gap_calibration_truth"])
     assert bags[0] == bags[1]
-    assert told["time_offset"] == pytest.approx(-0.012)
-    assert told["T_body_lens"]["translation"] == pytest.approx(truth.scope.body_to_lens(0.0)[:3, 3])
+    assert reported["time_offset"] == pytest.approx(-0.012)
+    assert reported["T_body_lens"]["translation"] == pytest.approx(truth.scope.body_to_lens(0.0)[:3, 3])
 
 
 def test_the_tip_stays_while_pivoting() -> None:

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from knee_gap_simulation.bench import Bench
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.knee import NEAREST_WITHIN, KneeScene
-from knee_gap_simulation.knee_field import CONDYLE, MENISCUS, PLATEAU
-from knee_gap_simulation.knee_truth import EdgeKind, Visibility
+from knee_gap_simulation.knee.ground_truth import EdgeKind, Visibility
+from knee_gap_simulation.knee.scene import NEAREST_WITHIN, KneeScene
+from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.rigid import inverse
+from knee_gap_simulation.surfaces.distance_field import CONDYLE, MENISCUS, PLATEAU
 
 SEEDS = (3, 17, 40)
 
 
 @pytest.fixture(scope="module")
-def bench() -> Bench:
-    return Bench(1, 17, gap=0.004, depth=0.010, duration_s=0.5, hardness={"texture": 0})
+def simulator() -> KneeSimulator:
+    return KneeSimulator(1, 17, gap=0.004, depth=0.010, duration_s=0.5, difficulty={"texture": 0})
 
 
 @pytest.fixture(scope="module")
-def frames(bench):
-    return list(bench.frames(0, 30, 15))
+def frames(simulator):
+    return list(simulator.frames(0, 30, 15))
 
 
 def surface_samples(scene: KneeScene, surface: int, start: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -57,59 +57,62 @@ def test_the_gap_is_the_smallest_distance_between_the_surfaces(seed):
         assert nearest - lower_bound < brute < nearest + upper_bound
 
 
-def test_rays_stop_at_the_first_surface(bench, frames):
+def test_rays_stop_at_the_first_surface(simulator, frames):
     """Walk each ray in small steps: all free before the hit, on the surface at it."""
-    T_scene_lens = inverse(bench.T_world_scene) @ frames[0].T_world_lens
+    T_scene_lens = inverse(simulator.T_world_scene) @ frames[0].T_world_lens
     pixels = np.random.default_rng(4).uniform([290.0, 5.0], [990.0, 710.0], (300, 2))
-    bearings = bench.lens.bearings(pixels)
+    bearings = simulator.lens.bearings(pixels)
     bearings = bearings[np.isfinite(bearings[:, 0])]
     origin, directions = T_scene_lens[:3, 3], bearings @ T_scene_lens[:3, :3].T
-    points, normals, surfaces, lengths = bench.scene.cast(origin, directions)
+    points, normals, surfaces, lengths = simulator.scene.cast(origin, directions)
     assert len(set(surfaces)) >= 3
     assert (np.einsum("ij,ij->i", normals, directions) < 1e-2).all()
     for point, surface in zip(points, surfaces, strict=True):
-        assert abs(bench.scene.distance(point, int(surface))[0]) < 2e-6
+        assert abs(simulator.scene.distance(point, int(surface))[0]) < 2e-6
     share = np.linspace(0.0, 1.0, 400)[:-1]
     walk = origin + (share[:, None, None] * lengths[:, None]) * directions
-    assert bench.scene.distance(walk.reshape(-1, 3)).min() > -2e-6
+    assert simulator.scene.distance(walk.reshape(-1, 3)).min() > -2e-6
 
 
-def test_hits_are_exact(bench, frames):
+def test_hits_are_exact(simulator, frames):
     """Off grazing rays the surface is met to a nanometre, not merely to the renderer's tolerance."""
     pixels = np.random.default_rng(5).uniform([400.0, 60.0], [880.0, 660.0], (200, 2))
-    points = bench.points(frames[0], pixels)
-    T_scene_world = inverse(bench.T_world_scene)
+    points = simulator.points(frames[0], pixels)
+    T_scene_world = inverse(simulator.T_world_scene)
     local = points.points @ T_scene_world[:3, :3].T + T_scene_world[:3, 3]
-    sight = frames[0].T_world_lens[:3, 3] - points.points
-    facing = np.einsum("ij,ij->i", points.normals, sight / np.linalg.norm(sight, axis=1)[:, None]) > 0.1
+    observation = frames[0].T_world_lens[:3, 3] - points.points
+    facing = (
+        np.einsum("ij,ij->i", points.normals, observation / np.linalg.norm(observation, axis=1)[:, None])
+        > 0.1
+    )
     for place, surface in zip(local[facing], points.surfaces[facing], strict=True):
-        assert abs(bench.scene.distance(place, int(surface))[0]) < 1e-9
+        assert abs(simulator.scene.distance(place, int(surface))[0]) < 1e-9
 
 
-def test_points_are_found_again(bench, frames):
+def test_points_are_found_again(simulator, frames):
     """A visible point's pixel in a later frame shows that very point."""
     pixels = np.random.default_rng(6).uniform([420.0, 80.0], [860.0, 640.0], (120, 2))
-    points = bench.points(frames[0], pixels)
-    same = bench.follow(points, frames[0])
+    points = simulator.points(frames[0], pixels)
+    same = simulator.follow(points, frames[0])
     seen = same.visibility == Visibility.VISIBLE
     assert np.abs(same.pixels - pixels).max() < 1e-6
     assert seen.mean() > 0.95
-    later = bench.follow(points, frames[1])
-    there = bench.points(frames[1], later.pixels[later.visible])
+    later = simulator.follow(points, frames[1])
+    there = simulator.points(frames[1], later.pixels[later.visible])
     assert np.linalg.norm(there.points - points.points[later.visible], axis=1).max() < 60e-6
     assert np.abs(later.pixels - pixels)[later.visible].max() > 0.5
 
 
-def test_hidden_points_are_told(bench, frames):
-    points = bench.points(frames[0], [[642.0, 250.0]])
+def test_hidden_points_are_told(simulator, frames):
+    points = simulator.points(frames[0], [[642.0, 250.0]])
     lens = frames[0].T_world_lens[:3, 3]
     deeper = points._replace(points=points.points + 0.1 * (points.points - lens))
-    assert bench.follow(deeper, frames[0]).visibility[0] == Visibility.BEHIND_TISSUE
+    assert simulator.follow(deeper, frames[0]).visibility[0] == Visibility.BEHIND_TISSUE
     behind = points._replace(points=2.0 * lens - points.points)
-    assert bench.follow(behind, frames[0]).visibility[0] == Visibility.OUT_OF_VIEW
+    assert simulator.follow(behind, frames[0]).visibility[0] == Visibility.OUT_OF_VIEW
 
 
-def test_contour_offsets_agree_with_the_mask(bench, frames):
+def test_contour_offsets_agree_with_the_mask(simulator, frames):
     """The distance to the nearest edge, by rays, against that to the nearest gap pixel of the picture."""
     frame = frames[0]
     rows, columns = np.nonzero(frame.gap_mask)
@@ -119,14 +122,14 @@ def test_contour_offsets_agree_with_the_mask(bench, frames):
     for edge, sign, kind in ((inside.min(), -1, EdgeKind.CONTOUR), (inside.max(), 1, EdgeKind.RIM)):
         for away in (4, 12, 25):
             pixel = np.array([column, edge + sign * away], dtype=float)
-            sighting = bench.follow(bench.points(frame, pixel), frame)
+            observation = simulator.follow(simulator.points(frame, pixel), frame)
             brute = np.linalg.norm(gap - pixel, axis=1).min()
-            assert sighting.contour_offset_px[0] == pytest.approx(brute, abs=1.2)
-            assert sighting.edge_kinds[0] == kind
-            expected = brute / bench.lens.focal_px
-            assert sighting.contour_offset[0] == pytest.approx(expected, rel=0.1, abs=0.003)
+            assert observation.contour_offset_px[0] == pytest.approx(brute, abs=1.2)
+            assert observation.edge_kinds[0] == kind
+            expected = brute / simulator.lens.focal_px
+            assert observation.contour_offset[0] == pytest.approx(expected, rel=0.1, abs=0.003)
     middle = np.array([column, 0.5 * (inside.min() + inside.max())])
-    assert not bench.follow(bench.points(frame, middle), frame).contour_offset_px[0] > 0.0
+    assert not simulator.follow(simulator.points(frame, middle), frame).contour_offset_px[0] > 0.0
 
 
 def test_the_mask_is_dark(frames):
@@ -138,9 +141,9 @@ def test_the_mask_is_dark(frames):
 
 
 def test_a_closed_joint_shows_no_gap():
-    bench = Bench(0, 17, gap=None, duration_s=0.1)
-    assert bench.nearest_distance < 0.0
-    frame = next(bench.frames())
+    simulator = KneeSimulator(0, 17, gap=None, duration_s=0.1)
+    assert simulator.nearest_distance < 0.0
+    frame = next(simulator.frames())
     assert frame.gap_mask.mean() < 2e-4
     assert frame.image.max() > 100
 

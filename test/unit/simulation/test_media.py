@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from knee_gap_replay.bag import BagReader
-from knee_gap_simulation.bench import Bench
-from knee_gap_simulation.calibration_bag import CalibrationRecording, calibration_truth
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_simulation.calibration.bag import CalibrationRecording, calibration_truth
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.make_bag import Recording, main, make_bag
-from knee_gap_simulation.media import Media, RefractedLens, index_of
-from knee_gap_simulation.motion import HandMotion, TravelDirection
-from knee_gap_simulation.pinhole import PinholeLens
-from knee_gap_simulation.truth import METADATA_KEY, scene_from_metadata
+from knee_gap_simulation.recordings.scene_truth import METADATA_KEY, scene_from_metadata
+from knee_gap_simulation.scope.hand_motion import HandMotion, TravelDirection
+from knee_gap_simulation.scope.lens import Lens
+from knee_gap_simulation.scope.media import Media, RefractedLens, index_of
+from knee_gap_simulation.scope.pinhole import PinholeLens
 
 RATIO = 1 / 1.336
 
@@ -99,24 +99,24 @@ def test_a_bag_says_its_media_and_keeps_the_calibrated_camera(tmp_path: Path) ->
     with BagReader(tmp_path / "bag") as bag:
         info = bag.deserialize(next(iter(bag.messages(["/knee_gap/camera_info"]))))
         back = scene_from_metadata(bag.metadata)
-        told = json.loads(bag.metadata[METADATA_KEY])["recording"]
+        reported = json.loads(bag.metadata[METADATA_KEY])["recording"]
     assert info.k[0] == Lens().focal_px
     assert back.lens == truth.lens == RefractedLens.of(Lens(), RATIO)
     assert back.media == truth.media == Media("air", "saline")
-    assert (told["medium"], told["portal"]) == ("saline", 0.05)
+    assert (reported["medium"], reported["portal"]) == ("saline", 0.05)
 
 
 def test_what_is_not_asked_for_changes_nothing() -> None:
     assert Recording().media == Media("saline", "saline")
     assert Recording(scope_of=3).media == Media("air", "saline")
     assert not {"medium", "calibrated_in", "portal"} & set(Recording().as_dict())
-    assert not {"media", "portal"} & set(Bench(0, 5).settings.as_dict())
-    assert Bench(0, 5).lens == Lens()
+    assert not {"media", "portal"} & set(KneeSimulator(0, 5).settings.as_dict())
+    assert KneeSimulator(0, 5).lens == Lens()
     assert "medium" not in CalibrationRecording().as_dict()
 
 
 def test_a_knee_and_a_board_lie_in_the_medium_too() -> None:
-    wet = Bench(0, 5, medium="saline", calibrated_in="air", portal=0.05, travel=0.006)
+    wet = KneeSimulator(0, 5, medium="saline", calibrated_in="air", portal=0.05, travel=0.006)
     assert wet.lens == RefractedLens.of(Lens(), RATIO)
     assert wet.settings.as_dict()["media"] == ("air", "saline")
     dry, bath = (calibration_truth(CalibrationRecording(seed=9, medium=m)).lens for m in ("air", "saline"))

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.optitrack.body_source import choose_body
-from knee_gap_perception.optitrack.natnet_client import NatNetClient, NatNetParameters
-from knee_gap_perception.optitrack.natnet_packets import NatNetVersion, decode_packet
-from knee_gap_perception.pose_validity import RefusalReason
-from knee_gap_perception.poses import BodyPose, LensPose
-from knee_gap_perception.tracking import ScopeTracker, TrackingParameters
-from knee_gap_simulation import natnet_server_packets as packets
+from knee_gap_perception.scope_pose.pose_validity import RefusalReason
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.trackers.body_source import choose_body
+from knee_gap_perception.trackers.natnet.client import NatNetClient, NatNetParameters
+from knee_gap_perception.trackers.natnet.packets import NatNetVersion, decode_packet
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.natnet_server import NatNetServer, ServerSettings
-from knee_gap_simulation.natnet_server_command import main
-from knee_gap_simulation.natnet_server_packets import VERSIONS
-from knee_gap_simulation.natnet_server_scene import CLOCK_SECONDS, Faults, TrackedScene
+from knee_gap_simulation.natnet import packets
+from knee_gap_simulation.natnet.command import main
+from knee_gap_simulation.natnet.packets import VERSIONS
+from knee_gap_simulation.natnet.scene import CLOCK_SECONDS, Faults, TrackedScene
+from knee_gap_simulation.natnet.server import NatNetServer, ServerSettings
 
 
 def free_port():

@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_replay.bag import BagReader
+from knee_gap_core.bag.bag import BagReader
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.imaging import tone_table
-from knee_gap_simulation.lens import Lens
 from knee_gap_simulation.make_bag import Recording, main, make_bag
-from knee_gap_simulation.motion import HandMotion
-from knee_gap_simulation.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE
-from knee_gap_simulation.render import ScopeCamera
+from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE
+from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_simulation.rigid import inverse, transform
-from knee_gap_simulation.rims import LOWER, UPPER, WALL, RimScene
-from knee_gap_simulation.scope import Scope
-from knee_gap_simulation.truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.rims.render import ScopeCamera
+from knee_gap_simulation.rims.scene import LOWER, UPPER, WALL, RimScene
+from knee_gap_simulation.scope.arthroscope import Scope
+from knee_gap_simulation.scope.hand_motion import HandMotion
+from knee_gap_simulation.scope.imaging import tone_table
+from knee_gap_simulation.scope.lens import Lens
 
 
 @pytest.fixture(scope="module")
@@ -161,9 +161,9 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 )
 def test_a_mistake_gets_one_line_and_leaves_no_bag(tmp_path, capsys, arguments, reason):
     assert main([str(tmp_path / "bag"), *arguments]) != 0
-    told = capsys.readouterr().err.strip()
-    assert "\n" not in told
-    assert re.search(reason, told)
+    reported = capsys.readouterr().err.strip()
+    assert "\n" not in reported
+    assert re.search(reason, reported)
     assert not (tmp_path / "bag").exists()
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.lens import Lens
+from knee_gap_simulation.scope.lens import Lens
 
 
 @pytest.fixture

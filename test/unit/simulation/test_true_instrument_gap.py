@@ -1,25 +1,23 @@
 """The instrument gap: closed forms, laws, and both scenes against slow independent searches."""
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.optimize import differential_evolution, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from knee_gap_simulation.bench import Bench
+from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.instrument_gap import CONE, REACH, instrument_gap
-from knee_gap_simulation.knee import KneeScene
-from knee_gap_simulation.knee_field import CAPSULE, CONDYLE, MENISCUS, PLATEAU
-from knee_gap_simulation.lens import Lens
-from knee_gap_simulation.motion import HandMotion
+from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.recordings.scene_truth import SceneTruth
+from knee_gap_simulation.recordings.section_truth import edge_contacts, section_truth, true_instrument_gap
 from knee_gap_simulation.rigid import inverse, transform
-from knee_gap_simulation.rims import RimScene
-from knee_gap_simulation.scope import Scope
-from knee_gap_simulation.section_truth import edge_contacts, section_truth, true_instrument_gap
-from knee_gap_simulation.truth import SceneTruth
-
-Array = npt.NDArray[np.float64]
+from knee_gap_simulation.rims.scene import RimScene
+from knee_gap_simulation.scope.arthroscope import Scope
+from knee_gap_simulation.scope.hand_motion import HandMotion
+from knee_gap_simulation.scope.lens import Lens
+from knee_gap_simulation.surfaces.distance_field import CAPSULE, CONDYLE, MENISCUS, PLATEAU
+from knee_gap_simulation.surfaces.instrument_gap import CONE, REACH, instrument_gap
 
 MICROMETRE = 1e-6
 
@@ -94,14 +92,14 @@ def test_between_two_cylinders_at_different_depths(view: float, cone: float) -> 
     distance = float(np.linalg.norm(apart))
     # Turned by `view` from the direction in which the cylinders are farthest apart.
     angle = np.arctan2(-apart[1], apart[0]) + np.radians(view)
-    sight = np.array([0.0, np.sin(angle), np.cos(angle)])
+    observation = np.array([0.0, np.sin(angle), np.cos(angle)])
     across = np.array([0.0, np.cos(angle), -np.sin(angle)])
     # Lines of sight along u touch where the normal is perpendicular to u.
     edges = [
         np.array([0.0, *centres[0]]) + radii[0] * across,
         np.array([0.0, *centres[1]]) - radii[1] * across,
     ]
-    found = instrument_gap(np.concatenate(points), edges, sight, cone=np.radians(cone))
+    found = instrument_gap(np.concatenate(points), edges, observation, cone=np.radians(cone))
     left = max(0.0, np.radians(abs(view) - cone))
     assert found.diameter == pytest.approx(distance * np.cos(left) - sum(radii), abs=2 * MICROMETRE)
 
@@ -188,10 +186,10 @@ class Section:
 
 
 def knee_section(level: int, seed: int) -> Section:
-    bench = Bench(level, seed)
-    assert bench.settings.gap is not None
-    middle = bench.scene.ridge(0.5e-3)[0] - (0.0, 0.5 * bench.settings.gap, 0.0)
-    return Section(bench.scene, bench.pose(1.2), middle)
+    simulator = KneeSimulator(level, seed)
+    assert simulator.settings.gap is not None
+    middle = simulator.scene.ridge(0.5e-3)[0] - (0.0, 0.5 * simulator.settings.gap, 0.0)
+    return Section(simulator.scene, simulator.pose(1.2), middle)
 
 
 def rim_section(seed: int) -> Section:

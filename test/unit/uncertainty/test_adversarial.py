@@ -8,18 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.pose_buffer import LensPose
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
-Array = npt.NDArray[np.float64]
 
 SECOND = 10**9
 IMAGES = 150
@@ -39,8 +38,8 @@ class Scope:
     turn: float = 0.3
     tremor: float = 0.1e-3
     shift: Callable[[float], Array] = lambda t: np.zeros((2, 3))
-    pose_told: Callable[[LensPose, float], LensPose] = lambda pose, t: pose
-    edges_told: Callable[[EdgeObservation, float], EdgeObservation] = lambda edges, t: edges
+    pose_reported: Callable[[LensPose, float], LensPose] = lambda pose, t: pose
+    edges_reported: Callable[[EdgeObservation, float], EdgeObservation] = lambda edges, t: edges
     late: float = 0.0
     seen: Callable[[float], bool] = lambda t: True
     along: Array = field(init=False)
@@ -84,7 +83,7 @@ class Scope:
             turned.as_quat(),
             np.diag(np.repeat([LENS_ERROR**2 / 3, ROTATION_ERROR**2 / 3], 3)),
         )
-        return self.pose_told(pose, t)
+        return self.pose_reported(pose, t)
 
     def leg(self, t: float) -> LensPose:
         """What the tracker says of a body fixed to the second point."""
@@ -101,7 +100,7 @@ class Scope:
         bearings += error - np.sum(error * bearings, axis=1, keepdims=True) * bearings
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         covariances = SIGMA**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
-        return self.edges_told(
+        return self.edges_reported(
             EdgeObservation(
                 SECOND + round(t * 1e9), 1, True, bearings, covariances, angular_error=3.0 * SIGMA
             ),
@@ -161,7 +160,7 @@ def test_pose_that_freezes_while_the_scope_goes_on(scope: Scope) -> None:
         held.append(pose)
         return replace(held[0], stamp_ns=pose.stamp_ns)
 
-    scope.pose_told = frozen
+    scope.pose_reported = frozen
     estimates = scope.estimates()
     assert not scope.outside(estimates)
     during = [e for e in estimates if 1.0 < (e.stamp_ns - SECOND) / 1e9 < 1.9]
@@ -172,7 +171,7 @@ def test_points_that_change_places(scope: Scope) -> None:
     def swapped(edges: EdgeObservation, t: float) -> EdgeObservation:
         return replace(edges, bearings=edges.bearings[::-1].copy()) if t > 1.5 else edges
 
-    scope.edges_told = swapped
+    scope.edges_reported = swapped
     estimates = scope.estimates()
     assert not scope.outside(estimates)
     after = [e for e in estimates if 1.5 < (e.stamp_ns - SECOND) / 1e9 < 1.58]
@@ -182,7 +181,7 @@ def test_points_that_change_places(scope: Scope) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_tracker_that_jumps(scope: Scope, axis: int) -> None:
-    scope.pose_told = lambda pose, t: replace(
+    scope.pose_reported = lambda pose, t: replace(
         pose, position=pose.position + (t > 1.5) * 1e-3 * np.eye(3)[axis]
     )
     estimates = scope.estimates()
@@ -230,7 +229,7 @@ def test_edge_that_is_wrong_from_the_start(scope: Scope) -> None:
         bearings[1] += [0.0, np.tan(np.radians(4.0)), 0.0]
         return replace(edges, bearings=bearings / np.linalg.norm(bearings, axis=1, keepdims=True))
 
-    scope.edges_told = wrong
+    scope.edges_reported = wrong
     estimates = scope.estimates()
     assert not scope.outside(estimates)
     assert GapStatus.JOINT_MOVED in statuses(estimates)
@@ -251,7 +250,7 @@ def test_scope_that_only_turns(scope: Scope) -> None:
 def test_scope_at_rest_whose_tracker_drifts(scope: Scope) -> None:
     """0.5 mm/s over 2.5 s: as far as a travel that would be measured."""
     scope.travel = 0.0
-    scope.pose_told = lambda pose, t: replace(pose, position=pose.position + 0.5e-3 * t * np.eye(3)[0])
+    scope.pose_reported = lambda pose, t: replace(pose, position=pose.position + 0.5e-3 * t * np.eye(3)[0])
     assert not scope.outside(scope.estimates())
 
 

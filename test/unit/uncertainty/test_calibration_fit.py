@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.calibration_fit import explained_by
-from knee_gap_uncertainty.gap_estimate import GapStatus
-from knee_gap_uncertainty.multi_view import fit
-from knee_gap_uncertainty.scope_calibration import CalibrationError
-from knee_gap_uncertainty.simulated_scope import POINTS, SIGMA, Hand, stated, wrong_scope
-from knee_gap_uncertainty.views import Views
+from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
+from knee_gap_uncertainty.multi_view.views import Views
+from knee_gap_uncertainty.scope_calibration.calibration_fit import explained_by
+from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError
+from knee_gap_uncertainty.studies.wrong_calibration.simulated_scope import (
+    POINTS,
+    SIGMA,
+    Hand,
+    stated,
+    wrong_scope,
+)
 
 LARGE = (2e-3, np.radians(1.5), 3e-3)
 
@@ -19,9 +25,9 @@ LARGE = (2e-3, np.radians(1.5), 3e-3)
 def test_a_wrong_calibration_with_a_stated_error_is_no_motion() -> None:
     gap = float(np.linalg.norm(POINTS[1] - POINTS[0]))
     for seed in range(6):
-        told = wrong_scope(seed, *LARGE)
-        assert GapStatus.JOINT_MOVED not in {one.status for one in told}
-        valid = [one for one in told if one.status is GapStatus.VALID]
+        reported = wrong_scope(seed, *LARGE)
+        assert GapStatus.JOINT_MOVED not in {one.status for one in reported}
+        valid = [one for one in reported if one.status is GapStatus.VALID]
         assert all(one.gap_min < gap < one.gap_max for one in valid)
 
 
@@ -29,9 +35,9 @@ def test_a_wrong_calibration_with_a_stated_error_is_no_motion() -> None:
 def test_a_joint_that_moves_is_still_found(scope: tuple[float, float, float]) -> None:
     across = np.array([0.0, 0.002, 0.0])
     for seed in range(4):
-        told = [one.status for one in wrong_scope(seed, *scope, moved=across)]
-        assert GapStatus.JOINT_MOVED in told[75:]
-        assert GapStatus.JOINT_MOVED not in told[:75]
+        reported = [one.status for one in wrong_scope(seed, *scope, moved=across)]
+        assert GapStatus.JOINT_MOVED in reported[75:]
+        assert GapStatus.JOINT_MOVED not in reported[:75]
 
 
 @pytest.mark.parametrize("axis", range(7))
@@ -55,7 +61,7 @@ def test_a_picture_that_turns_on_the_sensor_changes_nothing() -> None:
     turns = np.linspace(-1.0, 2.0, len(views))
     back = Rotation.from_rotvec(np.outer(-turns, [0.0, 0.0, 1.0])).as_matrix()
     assert views.lens_rotations is not None
-    turned = replace(views, lens_rotations=views.lens_rotations @ back, scope_turns=turns)
+    turned = replace(views, lens_rotations=views.lens_rotations @ back, scope_rotations=turns)
     error = CalibrationError(stated(*LARGE[:2]), LARGE[2])
     one, other = explained_by(error, views), explained_by(error, turned)
     assert one is not None

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.common_offset import STRAIGHT
-from knee_gap_uncertainty.confidence_interval import confidence_interval, interval_ends
-from knee_gap_uncertainty.coverage.cells import ERROR_SETS, Cell, Scene
-from knee_gap_uncertainty.coverage.intervals import intervals
-from knee_gap_uncertainty.coverage.tracks import simulate, true_bearings, true_track
-from knee_gap_uncertainty.multi_view import MultiViewFit, fit
-from knee_gap_uncertainty.views import Views, bearing_covariances
+from knee_gap_uncertainty.multi_view.common_offset import STRAIGHT
+from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval, interval_ends
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, fit
+from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances
+from knee_gap_uncertainty.studies.coverage.cells import ERROR_SETS, Cell, Scene
+from knee_gap_uncertainty.studies.coverage.intervals import intervals
+from knee_gap_uncertainty.studies.coverage.tracks import simulate, true_bearings, true_track
 
 VIEWS = 60
 # Points up to 80 degrees off the axis, and up to 62 degrees.

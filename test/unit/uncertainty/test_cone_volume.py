@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from knee_gap_uncertainty.cone_volume import ConeVolume, farthest_point, volume_distance
-from knee_gap_uncertainty.gap_range import gap_range
-from knee_gap_uncertainty.vectors import vector
+from knee_gap_uncertainty.numerics.vectors import vector
+from knee_gap_uncertainty.two_view.cone_volume import ConeVolume, farthest_point, volume_distance
+from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 
 def unit(vectors):
@@ -91,7 +91,7 @@ def test_gap_narrower_than_the_rings_is_never_below_its_least(apex):
     travel = 10e-3 * np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
     points = np.array([[-0.47e-3, 0.0, 19.83e-3], [0.47e-3, 0.0, 20.17e-3]])
     gap = np.linalg.norm(points[1] - points[0])
-    told, wide = 0, 0
+    reported, wide = 0, 0
     for _ in range(400):
         angle, radius = 2 * np.pi * rng.random((2, 1)), theta * np.sqrt(rng.uniform(0.7, 1.0, (2, 1)))
         offset = radius * np.hstack([np.cos(angle), np.sin(angle), np.zeros((2, 1))])
@@ -106,7 +106,7 @@ def test_gap_narrower_than_the_rings_is_never_below_its_least(apex):
             interval="worst_case",
             apex=apex,
         )
-        told += found.gap_min > 0.0
+        reported += found.gap_min > 0.0
         wide += found.gap > 3e-3
         assert found.gap_min <= gap <= found.gap_max
     assert wide > 40

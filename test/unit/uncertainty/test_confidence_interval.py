@@ -7,15 +7,15 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import minimize
 
-from knee_gap_uncertainty.confidence_interval import confidence_interval
-from knee_gap_uncertainty.coverage.cells import ERROR_SETS, SHARES, Cell, Scene
-from knee_gap_uncertainty.coverage.intervals import intervals
-from knee_gap_uncertainty.coverage.tracks import simulate
-from knee_gap_uncertainty.curved_test import accepted_above, stray_probability
-from knee_gap_uncertainty.distance_extremes import largest_distance, smallest_distance
 from knee_gap_uncertainty.errors import BadInputError
-from knee_gap_uncertainty.multi_view import MultiViewFit, fit, points_of
-from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval
+from knee_gap_uncertainty.multi_view.curvature_correction import accepted_above, stray_probability
+from knee_gap_uncertainty.multi_view.ellipsoid_distance import largest_distance, smallest_distance
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, fit, points_of
+from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.studies.coverage.cells import ERROR_SETS, SHARES, Cell, Scene
+from knee_gap_uncertainty.studies.coverage.intervals import intervals
+from knee_gap_uncertainty.studies.coverage.tracks import simulate
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.coverage import command
-from knee_gap_uncertainty.coverage.bound import bound
-from knee_gap_uncertainty.coverage.cells import ERROR_SETS, SHARES, Cell, Scene, cells
-from knee_gap_uncertainty.coverage.intervals import intervals
-from knee_gap_uncertainty.coverage.measure import Batch, batches, measure
-from knee_gap_uncertainty.coverage.plot import save_plot
-from knee_gap_uncertainty.coverage.table import summary, write_csv
-from knee_gap_uncertainty.coverage.tracks import simulate, true_bearings, true_track
-from knee_gap_uncertainty.coverage.unfinished import Unfinished
+from knee_gap_uncertainty.studies.coverage import command
+from knee_gap_uncertainty.studies.coverage.bound import bound
+from knee_gap_uncertainty.studies.coverage.cells import ERROR_SETS, SHARES, Cell, Scene, cells
+from knee_gap_uncertainty.studies.coverage.intervals import intervals
+from knee_gap_uncertainty.studies.coverage.measure import Batch, batches, measure
+from knee_gap_uncertainty.studies.coverage.plot import save_plot
+from knee_gap_uncertainty.studies.coverage.table import summary, write_csv
+from knee_gap_uncertainty.studies.coverage.tracks import simulate, true_bearings, true_track
+from knee_gap_uncertainty.studies.coverage.unfinished import Unfinished
 
 CELL = Cell(Scene(0.008, 0.004, 0.003, 45), ERROR_SETS[0], 2, "half", "bounded", "right")
 
@@ -148,10 +148,10 @@ def test_an_interrupted_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
     assert number == batch.number
     assert repr(again) == repr(rows)
     assert Unfinished(tmp_path, 11, 5).read() == {}
-    told = ["--out", str(tmp_path), "--seed", "5", "--so-far", "--runs"]
-    assert command.main([*told, "10"]) == 0
+    reported = ["--out", str(tmp_path), "--seed", "5", "--so-far", "--runs"]
+    assert command.main([*reported, "10"]) == 0
     assert (tmp_path / "coverage.csv").exists()
-    assert command.main([*told, "11"]) == 2
+    assert command.main([*reported, "11"]) == 2
     begun.remove()
     assert begun.read() == {}
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from travelling_scope import TINY, travelling
 
+from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_uncertainty.delays import ContinuedClock, DelayFloor
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.gap_estimate import GapStatus
 
 MS = 1_000_000
 SECOND = 1_000_000_000

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.gap_range import gap_range
-from knee_gap_uncertainty.pose_buffer import LensPose, PoseRefusal
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
+from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
@@ -74,7 +74,7 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
     positions = list(np.linspace(0.0, 0.006, 120))
     widths = []
     for drift, share in ((0.0, 0.0), (0.002, 0.0), (0.002, 1.0)):
-        parameters = EstimatorParameters(**EXACT_SCOPE, depth_drift=drift, lasting_share=share)
+        parameters = EstimatorParameters(**EXACT_SCOPE, scale_drift=drift, correlated_error_share=share)
         last = run(GapEstimator(parameters), positions)[-1]
         assert last.status is GapStatus.VALID
         widths.append(last.confidence_max - last.confidence_min)

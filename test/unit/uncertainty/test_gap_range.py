@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.gap_range import cloud_range, gap_range, warm_up
+from knee_gap_uncertainty.two_view.gap_range import cloud_range, gap_range, warm_up
 
 PSI = math.radians(2.364)
 DT = 0.0367e-3

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.error_cloud import error_clouds
-from knee_gap_uncertainty.gap_range import gap_range
-from knee_gap_uncertainty.triangulation import triangulate
-from knee_gap_uncertainty.two_views import two_views
+from knee_gap_uncertainty.two_view.error_cloud import error_clouds
+from knee_gap_uncertainty.two_view.gap_range import gap_range
+from knee_gap_uncertainty.two_view.triangulation import triangulate
+from knee_gap_uncertainty.two_view.two_views import two_views
 
 GOLDEN = Path(__file__).parents[4] / "shared" / "golden" / "error_cloud.json"
 APEX = {"first": "b_from_A0", "second": "a_from_A1"}

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.angle_sets import SIGNS
-from knee_gap_uncertainty.common_offset import STRAIGHT
 from knee_gap_uncertainty.instrument_gap import (
     CONE,
     KIND_CONTOUR,
@@ -20,8 +18,10 @@ from knee_gap_uncertainty.instrument_gap import (
     widest_gap,
     worst_case,
 )
-from knee_gap_uncertainty.multi_view import MultiViewFit
-from knee_gap_uncertainty.translation_volume import displacements
+from knee_gap_uncertainty.multi_view.common_offset import STRAIGHT
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
+from knee_gap_uncertainty.two_view.angle_sets import SIGNS
+from knee_gap_uncertainty.two_view.translation_volume import displacements
 
 LENS = np.zeros(3)
 
@@ -183,7 +183,7 @@ def test_bounds_hold_whatever_the_admitted_errors(seed):
         return np.array(turned)
 
     present, first = wrong(bearings(scene.points), theta), wrong(bearings(scene.points, lens[1]), theta)
-    told = [place + shift * unit(rng.standard_normal(3)) for place in lens]
+    reported = [place + shift * unit(rng.standard_normal(3)) for place in lens]
     # The edges move across the opening, which is the plane of the cylinders' section.
     signs = rng.choice([-1.0, 1.0], 2)
     edges = np.array(
@@ -194,7 +194,7 @@ def test_bounds_hold_whatever_the_admitted_errors(seed):
     )
     opening = opening_of(present, edges)
     lower, upper = worst_case(
-        told[1] - told[0],
+        reported[1] - reported[0],
         present,
         first,
         opening,

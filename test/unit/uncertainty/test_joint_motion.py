@@ -3,24 +3,32 @@
 from math import radians
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.joint_motion import FEWEST_CONTRADICTIONS, LARGEST_SHIFT, Finding, JointMotionTest
-from knee_gap_uncertainty.joint_motion_table import follow, main, selected
-from knee_gap_uncertainty.motion_statistics import LARGEST_PRESENT, motion_statistics, observations
-from knee_gap_uncertainty.multi_view import fit
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.simulated_motion import Situation, simulate
-from knee_gap_uncertainty.views import Views
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.joint_motion.joint_motion import (
+    FEWEST_CONTRADICTIONS,
+    LARGEST_SHIFT,
+    Finding,
+    JointMotionTest,
+)
+from knee_gap_uncertainty.joint_motion.motion_statistics import (
+    LARGEST_PRESENT,
+    motion_statistics,
+    observations,
+)
+from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
+from knee_gap_uncertainty.multi_view.views import Views
+from knee_gap_uncertainty.studies.joint_motion.simulated_motion import Situation, simulate
+from knee_gap_uncertainty.studies.joint_motion.table import follow, main, selected
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
-Array = npt.NDArray[np.float64]
 MS = 1_000_000
 FRAME_NS = 16_666_667
 POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])

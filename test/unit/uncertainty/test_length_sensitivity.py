@@ -5,16 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.angle_sets import SIGNS, angle_changes
-from knee_gap_uncertainty.length_sensitivity import (
+from knee_gap_uncertainty.two_view.angle_sets import SIGNS, angle_changes
+from knee_gap_uncertainty.two_view.length_sensitivity import (
     length_bound_linear,
     length_change,
     length_change_linear,
     length_error,
 )
-from knee_gap_uncertainty.translation_volume import DIRECTIONS, displacements
-from knee_gap_uncertainty.triangulation import triangulate
-from knee_gap_uncertainty.two_views import two_views
+from knee_gap_uncertainty.two_view.translation_volume import DIRECTIONS, displacements
+from knee_gap_uncertainty.two_view.triangulation import triangulate
+from knee_gap_uncertainty.two_view.two_views import two_views
 
 
 def unit(vectors):

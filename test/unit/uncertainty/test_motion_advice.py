@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.advice_task import PIECES, AdvicePace
 from knee_gap_uncertainty.errors import BadInputError
-from knee_gap_uncertainty.gap_range import gap_range
-from knee_gap_uncertainty.motion_advice import (
+from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdvicePace
+from knee_gap_uncertainty.motion_advice.motion_advice import (
     AdviceParameters,
     MotionAdvisor,
     Situation,
@@ -17,7 +16,8 @@ from knee_gap_uncertainty.motion_advice import (
     unit,
     width_after,
 )
-from knee_gap_uncertainty.views import Views
+from knee_gap_uncertainty.multi_view.views import Views
+from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 POINTS = np.array([[0.0, -0.002, 0.010], [0.0, 0.002, 0.010]])
 SIDEWAYS = np.array([1.0, 0.0, 0.0])
@@ -120,8 +120,8 @@ def test_width_of_the_interval_as_target() -> None:
 def test_a_width_that_is_promised_has_in_it_what_lasts_over_a_track() -> None:
     offset = 0.004 * SIDEWAYS
     plain = width_after(situation(), offset)
-    assert width_after(situation()._replace(lasting_share=1.0), offset) > 1.05 * plain
-    assert width_after(situation()._replace(depth_drift=0.02), offset) > 1.05 * plain
+    assert width_after(situation()._replace(correlated_error_share=1.0), offset) > 1.05 * plain
+    assert width_after(situation()._replace(scale_drift=0.02), offset) > 1.05 * plain
 
 
 def test_value_that_rises_and_falls_is_not_bisected_over_its_peak() -> None:

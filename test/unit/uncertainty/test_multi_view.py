@@ -7,11 +7,11 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from knee_gap_uncertainty.confidence_interval import confidence_interval
-from knee_gap_uncertainty.errors import BadInputError, TravelTooShortError
-from knee_gap_uncertainty.likelihood import Measured, blank, linearise, mean_frames
-from knee_gap_uncertainty.multi_view import MultiViewFit, fit, points_jacobian, points_of
-from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.errors import BadInputError, BaselineTooShortError
+from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval
+from knee_gap_uncertainty.multi_view.likelihood import Measured, blank, linearise, mean_frames
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, fit, points_jacobian, points_of
+from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
 
 Floats = npt.NDArray[np.float64]
 
@@ -283,8 +283,8 @@ def test_a_gross_error_is_gated_and_only_that() -> None:
 def test_errors_larger_than_stated_widen_the_covariance_from_ten_views_on() -> None:
     rng = np.random.default_rng(23)
     small = noisy(rng, 40, deviation=2 * DEVIATION)
-    told = views_of(small.lens_positions, small.bearings, deviation=DEVIATION)
-    assert fit(told).scale == pytest.approx(4.0, rel=0.4)
+    reported = views_of(small.lens_positions, small.bearings, deviation=DEVIATION)
+    assert fit(reported).scale == pytest.approx(4.0, rel=0.4)
     assert fit(noisy(rng, 40)).scale < 1.3
     two = noisy(rng, 2, deviation=5 * DEVIATION)
     assert fit(views_of(two.lens_positions, two.bearings)).scale == 1.0
@@ -295,7 +295,7 @@ def test_one_view_and_views_from_one_place_are_refused() -> None:
     with pytest.raises(BadInputError, match="at least 2 views are needed to measure depth, not 1"):
         fit(views_of(lens[:1], directions(lens[:1])))
     still = np.repeat(lens[:1], 5, axis=0)
-    with pytest.raises(TravelTooShortError, match="all 5 views have the same lens position"):
+    with pytest.raises(BaselineTooShortError, match="all 5 views have the same lens position"):
         fit(views_of(still, directions(still)))
 
 

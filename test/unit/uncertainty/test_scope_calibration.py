@@ -5,20 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from travelling_scope import NOTHING, Array, camera_errors, estimates, scope, spread, told
+from travelling_scope import NOTHING, camera_errors, estimates, reported, scope, spread
 
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.multi_view import fit
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.scope_calibration import (
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
+from knee_gap_uncertainty.multi_view.views import bearing_covariances
+from knee_gap_uncertainty.scope_calibration.scope_calibration import (
     CalibrationError,
     ScopeCalibration,
     contradiction,
     shared_error,
 )
-from knee_gap_uncertainty.views import bearing_covariances
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
@@ -32,8 +33,8 @@ def test_it_is_what_a_refit_with_a_wrong_scope_shows(axis: int) -> None:
     covariance = NOTHING.copy()
     if axis < 6:
         covariance[axis, axis] = size**2
-    told = spread(covariance, size if axis == 6 else 0.0, scope(20))
-    assert told == pytest.approx(shown, rel=0.15, abs=2e-6)
+    reported = spread(covariance, size if axis == 6 else 0.0, scope(20))
+    assert reported == pytest.approx(shown, rel=0.15, abs=2e-6)
 
 
 def test_a_shift_is_not_felt_by_a_scope_that_does_not_turn() -> None:
@@ -155,7 +156,7 @@ def test_drift_grows_with_the_time_between_the_views_and_does_not_average_out() 
 def test_a_covariance_that_was_rounded_in_a_file_is_one() -> None:
     column = np.array([1e-4, -2e-4, 1.5e-4, 1e-3, 2e-3, -1e-3])
     rounded = np.array([[float(f"{number:.7g}") for number in row] for row in np.outer(column, column)])
-    assert not told("tracking_node", "a" * 64, error=rounded).flaw()
+    assert not reported("tracking_node", "a" * 64, error=rounded).flaw()
 
 
 def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
@@ -163,7 +164,7 @@ def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
     assert views.lens_rotations is not None
     rotation = views.lens_rotations[0]
     bearings = views.bearings[0] @ rotation
-    same = told("tracking_node", "a" * 64, error=GOOD)
+    same = reported("tracking_node", "a" * 64, error=GOOD)
     estimator.add_calibration(same)
     counts = []
     for k, calibration in enumerate((same, replace(same), replace(same, lens_covariance=2.0 * GOOD))):
@@ -182,7 +183,7 @@ def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
 @pytest.mark.parametrize("turning", [0.0, 0.3])
 def test_the_largest_error_that_is_taken_gives_statuses(error: Array, clock: float, turning: float) -> None:
     found = estimates(
-        replace(told("tracking_node", "a" * 64, error=error), time_offset_error=clock), turning=turning
+        replace(reported("tracking_node", "a" * 64, error=error), time_offset_error=clock), turning=turning
     )
     assert len(found) == 40
     if clock or error.any():
@@ -193,20 +194,20 @@ def test_what_cannot_be_calculated_with_is_a_status(monkeypatch: pytest.MonkeyPa
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr("knee_gap_uncertainty.track.explained_by", singular)
-    found = estimates(told("tracking_node", "a" * 64, error=GOOD))
+    monkeypatch.setattr("knee_gap_uncertainty.gap_track.explained_by", singular)
+    found = estimates(reported("tracking_node", "a" * 64, error=GOOD))
     assert {one.status for one in found} == {GapStatus.UNKNOWN}
     assert "calculated" in found[-1].reason
 
 
 def test_an_image_whose_velocity_is_unknown_is_not_taken_where_the_clock_is_uncertain() -> None:
     """The first image lies at the only pose there is then."""
-    uncertain = replace(told("tracking_node", "a" * 64, error=GOOD), time_offset_error=1e-3)
+    uncertain = replace(reported("tracking_node", "a" * 64, error=GOOD), time_offset_error=1e-3)
     found = estimates(uncertain)
     assert found[0].status is GapStatus.OUT_OF_SYNC
     assert "how fast the lens moved" in found[0].reason
     assert found[1].status is not GapStatus.OUT_OF_SYNC
-    assert estimates(told("tracking_node", "a" * 64, error=GOOD))[0].status is not GapStatus.OUT_OF_SYNC
+    assert estimates(reported("tracking_node", "a" * 64, error=GOOD))[0].status is not GapStatus.OUT_OF_SYNC
 
 
 def test_it_does_not_average_out() -> None:
@@ -246,7 +247,11 @@ def test_the_cameras_errors_add_as_independent_ones_do() -> None:
 
 
 def test_nodes_with_different_calibrations_contradict_each_other() -> None:
-    one, other, none = told("tracking_node", "a" * 64), told("segmentation_node", "b" * 64), told("x", "")
+    one, other, none = (
+        reported("tracking_node", "a" * 64),
+        reported("segmentation_node", "b" * 64),
+        reported("x", ""),
+    )
     assert not contradiction({"tracking_node": one})
     assert not contradiction({"tracking_node": one, "segmentation_node": replace(other, hash="a" * 64)})
     words = contradiction({"tracking_node": one, "segmentation_node": other})
@@ -255,9 +260,9 @@ def test_nodes_with_different_calibrations_contradict_each_other() -> None:
 
 
 def test_nothing_is_valid_while_the_nodes_contradict_each_other() -> None:
-    same = estimates(told("tracking_node", "a" * 64), told("segmentation_node", "a" * 64))
+    same = estimates(reported("tracking_node", "a" * 64), reported("segmentation_node", "a" * 64))
     assert any(estimate.status is GapStatus.VALID for estimate in same)
-    different = estimates(told("tracking_node", "a" * 64), told("segmentation_node", ""))
+    different = estimates(reported("tracking_node", "a" * 64), reported("segmentation_node", ""))
     assert {estimate.status for estimate in different} == {GapStatus.UNKNOWN}
     assert "different calibrations" in different[-1].reason
 
@@ -265,7 +270,7 @@ def test_nothing_is_valid_while_the_nodes_contradict_each_other() -> None:
 def test_both_intervals_include_the_calibrations_error() -> None:
     without = estimates()[-1]
     poor = np.diag([1e-8] * 3 + [1e-5] * 3)
-    with_it = estimates(told("tracking_node", "a" * 64, error=poor))[-1]
+    with_it = estimates(reported("tracking_node", "a" * 64, error=poor))[-1]
     assert with_it.status is without.status is GapStatus.VALID
     assert with_it.gap == pytest.approx(without.gap)
     for low, high in (("gap_min", "gap_max"), ("confidence_min", "confidence_max")):
@@ -274,7 +279,7 @@ def test_both_intervals_include_the_calibrations_error() -> None:
 
 
 def test_both_intervals_include_the_cameras_error() -> None:
-    exact = told("tracking_node", "a" * 64, error=NOTHING)
+    exact = reported("tracking_node", "a" * 64, error=NOTHING)
     without, with_it = estimates(exact)[-1], estimates(exact, camera=3.0)[-1]
     assert with_it.status is without.status is GapStatus.VALID
     assert with_it.gap == pytest.approx(without.gap)
@@ -294,5 +299,5 @@ def test_both_intervals_include_a_cameras_error_without_a_calibration() -> None:
 
 
 def test_errors_of_a_camera_that_are_none_give_no_estimate() -> None:
-    wrong = estimates(told("tracking_node", "a" * 64, error=NOTHING), camera=float("nan"))
+    wrong = estimates(reported("tracking_node", "a" * 64, error=NOTHING), camera=float("nan"))
     assert {estimate.status for estimate in wrong} == {GapStatus.NO_EDGES}

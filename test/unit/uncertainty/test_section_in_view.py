@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, EdgeSection, EdgeState
+from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
 from knee_gap_uncertainty.gap_profile import gap_profile
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.instrument_gap import Edges, opening_of
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.posed_view import PosedView, posed_view
+from knee_gap_uncertainty.multi_view.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.section_edges import NOT_FINITE, NOT_YET, UNSEEN, SectionInView
 
 POINTS = np.array([[0.0, -0.003, 0.012], [0.0, 0.003, 0.012]])

@@ -7,11 +7,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.study.command import main
-from knee_gap_uncertainty.study.geometry import GapPlace, exact_views
-from knee_gap_uncertainty.study.geometry_fit import FITTED, READINGS, rms_mm
-from knee_gap_uncertainty.study.monte_carlo import shaken, simulate
-from knee_gap_uncertainty.study.scenarios import SCENARIOS, TABLE_4, TABLE_4_AVERAGE
+from knee_gap_uncertainty.studies.paper.command import main
+from knee_gap_uncertainty.studies.paper.geometry import GapPlace, exact_views
+from knee_gap_uncertainty.studies.paper.geometry_fit import FITTED, READINGS, rms_mm
+from knee_gap_uncertainty.studies.paper.monte_carlo import shaken, simulate
+from knee_gap_uncertainty.studies.paper.scenarios import SCENARIOS, TABLE_4, TABLE_4_AVERAGE
 
 FIGURES = ("figure_9a", "figure_9b", "figure_10", "figure_11", "figure_12", "table_4", "runs", "sensitivity")
 TABLES = ("table_3", "table_4", "runs", "geometry", "consistency", "figure_12")

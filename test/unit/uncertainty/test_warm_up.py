@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from knee_gap_uncertainty.gap_estimate import GapStatus
+from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_uncertainty.warm_up import warm_up
 
 SAMPLE = Path(__file__).parents[3] / "bags" / "sample"
@@ -19,8 +19,8 @@ def compile_and_tell(self, sig):
     late.append(f"{self.py_func.__name__}{sig}")
     return original(self, sig)
 dispatcher.Dispatcher.compile = compile_and_tell
-from knee_gap_replay.bag import BagReader
-from knee_gap_replay.parameters_file import ParametersFile
+from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import by_stamp
 from knee_gap_replay.topics import InputTopics

@@ -1,21 +1,20 @@
 """A scope that travels, for tests of the errors that all its views share."""
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.gap_estimate import EdgeObservation, GapEstimate
-from knee_gap_uncertainty.multi_view import fit
-from knee_gap_uncertainty.pose_buffer import LensPose
-from knee_gap_uncertainty.scope_calibration import CalibrationError, ScopeCalibration
-from knee_gap_uncertainty.scope_turns import ScopeTurn
-from knee_gap_uncertainty.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
+from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
+from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError, ScopeCalibration
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
-Array = npt.NDArray[np.float64]
 
 POINTS = np.array([[0.002, -0.002, 0.012], [0.001, 0.0021, 0.011]])
 NOTHING = np.zeros((6, 6))
@@ -57,7 +56,7 @@ def spread(covariance: Array, clock: float, views: Views) -> float:
     return float(np.sqrt(max(wider.gap_deviation**2 - fitted.gap_deviation**2, 0.0)))
 
 
-def told(node: str, digest: str, *, error: Array | None = None) -> ScopeCalibration:
+def reported(node: str, digest: str, *, error: Array | None = None) -> ScopeCalibration:
     return ScopeCalibration(node, digest, np.full((6, 6), np.nan) if error is None else error, 0.0)
 
 
@@ -105,12 +104,12 @@ def estimates(
     *calibrations: ScopeCalibration,
     camera: float | None = 0.0,
     turning: float = 0.3,
-    scope_turn: float = 0.0,
+    scope_rotation: float = 0.0,
     parameters: EstimatorParameters = EXACT,
 ) -> list[GapEstimate]:
     """What the estimator says of 40 views of the travelling scope, `camera` times its errors told.
 
-    None tells no error of the camera. It turns in its camera head by `scope_turn` [rad] on the way.
+    None tells no error of the camera. It turns in its camera head by `scope_rotation` [rad] on the way.
     """
     estimator, views, found = GapEstimator(parameters), scope(40, turning), []
     errors = np.zeros((40, 2, 3, 0)) if camera is None else camera * camera_errors(views, 0, 1, 2)
@@ -119,8 +118,8 @@ def estimates(
     for k in range(40):
         stamp_ns = 10**18 + k * 10_000_000
         edges, pose = observed(views, k, stamp_ns, errors[k])
-        if scope_turn:
-            found += estimator.add_turn(ScopeTurn(stamp_ns, scope_turn * k / 39), stamp_ns)
+        if scope_rotation:
+            found += estimator.add_rotation(ScopeRotation(stamp_ns, scope_rotation * k / 39), stamp_ns)
         estimator.add_pose(pose, stamp_ns)
         found += estimator.add_edges(edges, stamp_ns)
     return found

@@ -12,14 +12,15 @@ import numpy as np
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from knee_gap_node.user_files import FileError, read_yaml
+from knee_gap_core.user_files import FileError, read_yaml
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_perception.calibration.calibration_rules import broken_rule
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.notch import NotchShape
-from knee_gap_perception.calibration.rigid import Array, rigid
-from knee_gap_perception.calibration.scope_turn import Mount, ShaftAxis, turn_between, turned_lens
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.camera.medium import AIR, Medium, medium_of
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import AIR, Medium, medium_of
+from knee_gap_perception.scope_rotation.notch import NotchShape
+from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis, rotated_lens, rotation_between
 
 FORMAT = "knee_gap_calibration 1"
 
@@ -139,17 +140,17 @@ class Calibration:
             )
         return oblique.notch_shape
 
-    def body_to_lens(self, scope_turn: float = 0.0) -> Array:
+    def body_to_lens(self, scope_rotation: float = 0.0) -> Array:
         """`T_body_lens` (4, 4) at a turn [rad] of the scope in its camera head since the calibration.
 
         Raises PerceptionError where the lens, or for a turned scope its axis, was not calibrated.
         """
         lens = self.require_lens()
-        return turned_lens(
-            lens.T_body_lens, scope_turn, lens.mount, self.oblique.axis if self.oblique else None
+        return rotated_lens(
+            lens.T_body_lens, scope_rotation, lens.mount, self.oblique.axis if self.oblique else None
         )
 
-    def motion_by_turn(self, T_body_lens: Array) -> Array:
+    def motion_by_rotation(self, T_body_lens: Array) -> Array:
         """How the lens at (4, 4) on the body moves with the turn of the scope, in the frame of the body.
 
         (6,): position [m/rad], rotation [-]. Raises PerceptionError where the lens was not calibrated.
@@ -173,7 +174,7 @@ class Calibration:
             "oblique_angle": 0.0,
         }
 
-    def scope_turn(self, notch_angle: float) -> float:
+    def scope_rotation(self, notch_angle: float) -> float:
         """Turn [rad], in (-pi, pi], that a notch seen at an angle [rad] says.
 
         Raises PerceptionError where the notch was not calibrated.
@@ -183,7 +184,7 @@ class Calibration:
         turn = (notch_angle - self.oblique.notch_angle + np.pi) % (2 * np.pi) - np.pi
         return float(turn)
 
-    def scope_turn_of_body(self, T_head_scope: Array) -> float:
+    def scope_rotation_of_body(self, T_head_scope: Array) -> float:
         """Turn [rad] that a second body on the scope says, from its pose (4, 4) in the frame of the first.
 
         Raises PerceptionError where the second body was not calibrated.
@@ -192,7 +193,7 @@ class Calibration:
             raise PerceptionError(
                 "the calibration knows no second body on the scope: run calibrate oblique --scope-pose-topic"
             )
-        return turn_between(self.oblique.T_head_scope, T_head_scope, self.oblique.axis.direction)
+        return rotation_between(self.oblique.T_head_scope, T_head_scope, self.oblique.axis.direction)
 
     def with_parts(self, width_px: int, height_px: int, **parts: Any) -> "Calibration":
         """The calibration with some parts replaced. Raises PerceptionError for another image size."""

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knee_gap_perception.calibration.intrinsics import Intrinsics
-from knee_gap_perception.calibration.rigid import Array
-from knee_gap_perception.camera import MODELS
+from knee_gap_core.values.arrays import Array
+from knee_gap_perception.camera.intrinsics import Intrinsics
+from knee_gap_perception.camera.models import MODELS
 
 if TYPE_CHECKING:
     from knee_gap_perception.calibration.calibration_file import Calibration, LensOnBody, Oblique

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from knee_gap_node.user_files import FileError, expanded
+from knee_gap_core.user_files import FileError, expanded
 from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration
+from knee_gap_perception.camera.medium import CHOICES, Medium, medium_of
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.medium import CHOICES, Medium, medium_of
 from knee_gap_perception.parameters import check_parameters
 
 
@@ -30,7 +30,7 @@ class CalibrationParameters:
             "another medium are converted; the same for segmentation_node and tracking_node"
         },
     )
-    scope_turn_notch: bool = field(
+    scope_rotation_notch: bool = field(
         default=False,
         metadata={
             "description": "Whether the notch in each image tells how far an oblique scope is turned in its "
@@ -41,8 +41,10 @@ class CalibrationParameters:
 
     def __post_init__(self) -> None:
         check_parameters(self)
-        if not isinstance(self.scope_turn_notch, bool):
-            raise PerceptionError(f"scope_turn_notch must be true or false, not {self.scope_turn_notch!r}")
+        if not isinstance(self.scope_rotation_notch, bool):
+            raise PerceptionError(
+                f"scope_rotation_notch must be true or false, not {self.scope_rotation_notch!r}"
+            )
         medium_of(self.medium, "medium")
 
     @property

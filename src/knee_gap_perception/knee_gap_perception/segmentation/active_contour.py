@@ -3,8 +3,8 @@
 import numpy as np
 from skimage.segmentation import morphological_chan_vese
 
+from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.segmentation.even_light import even_light
-from knee_gap_perception.segmentation.strategy import Image, Mask
 
 
 class ChanVese:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.segmentation.strategy import Image, Mask
+from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.segmentation.three_classes import otsu3
 
 LOG_OFFSET = 12.0  # [grey levels]: the noise of a black gap makes no class of its own

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from skimage.segmentation import watershed
 
+from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.segmentation.even_light import even_light, log_levels
-from knee_gap_perception.segmentation.strategy import Image, Mask
 
 GAP, TISSUE = 1, 2
 

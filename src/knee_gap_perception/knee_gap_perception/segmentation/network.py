@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.segmentation.strategy import Image, Mask
 
 
 class Network:

@@ -2,11 +2,7 @@
 
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-Image = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
+from knee_gap_core.values.arrays import Image, Mask
 
 
 class Segmentation(Protocol):

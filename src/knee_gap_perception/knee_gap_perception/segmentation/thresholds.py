@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_perception.field_of_view import brightness
+from knee_gap_core.values.arrays import Image, Mask
+from knee_gap_perception.image.field_of_view import brightness
 from knee_gap_perception.segmentation.even_light import even_light
-from knee_gap_perception.segmentation.strategy import Image, Mask
 
 
 def otsu_threshold(values: npt.NDArray[np.uint8]) -> float:

@@ -1,0 +1,1 @@
+"""What every package stands on: values, bags, nodes, and the compilation of kernels."""

@@ -1,0 +1,314 @@
+"""Bags of ROS 2, written and read without ROS.
+
+A bag is a folder with `metadata.yaml` and MCAP files, as `ros2 bag` and Foxglove open it; a bare `.mcap` is
+read too. Times are integer nanoseconds.
+"""
+
+import os
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from rosbags.interfaces import Connection, Nodetype, Qos
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from knee_gap_core.bag import qos as qos_profiles
+from knee_gap_core.bag.bag_paths import missing_bag
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.mcap_file import McapFile, in_time_order, mcap_files
+from knee_gap_core.bag.mcap_storage import METADATA_RECORD, ChecksummedMcap
+from knee_gap_core.bag.message_types import full_name, known_type, typestore
+from knee_gap_core.bag.qos import PROFILES, QosName
+from knee_gap_core.user_files import FileError, flaw_of_new, read_yaml, reason_of
+
+# DDS pads what it sends; a bag written here and played and recorded again then has the same bytes.
+_DDS_ALIGNMENT = 4
+_CONVERT = "convert it first: rosbags-convert --src IN --dst OUT --dst-storage mcap"
+_STAMP_END = 12
+_HEADER_FIELD = ("header", (Nodetype.NAME, "std_msgs/msg/Header"))
+
+
+class BagMessage(NamedTuple):
+    """One message of a bag, serialised; `time_ns` is when it was recorded."""
+
+    topic: str
+    msgtype: str
+    time_ns: int
+    data: bytes
+
+
+class Topic(NamedTuple):
+    """What a bag says of one of its topics."""
+
+    msgtype: str
+    qos: tuple[Qos, ...]
+    encoding: str
+    definition: str
+    type_hash: str
+
+
+class _RosbagWriter(Writer):
+    STORAGE_PLUGINS: Mapping[StoragePlugin, Any] = {
+        **Writer.STORAGE_PLUGINS,
+        StoragePlugin.MCAP: ChecksummedMcap,
+    }
+
+
+class BagWriter:
+    """Writes a new bag; a context manager.
+
+    The same calls give the same bytes. What was written before an exception is kept and readable. Raises
+    BagError where `path` exists already or cannot be made.
+    """
+
+    def __init__(self, path: str | PathLike[str], *, metadata: Mapping[str, str] | None = None) -> None:
+        self.path = Path(path)
+        self._metadata = dict(metadata or {})
+        self._topics: dict[str, Connection] = {}
+        if flaw := flaw_of_new(self.path):
+            raise BagError(flaw)
+        self._writer = _RosbagWriter(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+
+    def __enter__(self) -> Self:
+        try:
+            self._writer.open()
+        except (OSError, WriterError) as error:
+            raise BagError(f"{self.path} cannot be made: {reason_of(error)}") from None
+        for key, value in self._metadata.items():
+            self._writer.set_custom_data(key, value)
+        if self._metadata:
+            self._storage.add_metadata(self._metadata)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._writer.close()
+        except OSError as failure:
+            raise BagError(f"{self.path} cannot be finished: {failure.strerror}") from failure
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages written so far, by topic."""
+        return {topic: self._writer.counts[connection.id] for topic, connection in self._topics.items()}
+
+    def add_topic(self, name: str, msgtype: str, qos: QosName | Sequence[Qos] = "reliable") -> None:
+        """Announce a topic; again with the same type is allowed.
+
+        `qos` is what its publisher offers: `sensor` (best effort), `reliable`, `latched` (kept for late
+        subscribers), or the profiles themselves. Raises BagError for an unknown type or quality of service.
+        """
+        msgtype = known_type(msgtype)
+        if (known := self._topics.get(name)) is not None:
+            if known.msgtype != msgtype:
+                raise BagError(f"topic {name} has type {known.msgtype}, not {msgtype}")
+            return
+        if isinstance(qos, str):
+            if qos not in PROFILES:
+                raise BagError(f"quality of service '{qos}' is unknown; valid are {', '.join(PROFILES)}")
+            qos = [PROFILES[qos]]
+        self._topics[name] = self._writer.add_connection(
+            name, msgtype, typestore=typestore(), offered_qos_profiles=qos
+        )
+
+    def write(self, topic: str, message: object, time_ns: int) -> None:
+        """Serialise a message of `knee_gap_core.bag.message_types` and write it with its time [ns]."""
+        connection = self._connection(topic)
+        data = bytes(typestore().serialize_cdr(message, connection.msgtype))
+        padding = bytes(-len(data) % _DDS_ALIGNMENT)
+        self._writer.write(connection, time_ns, data + padding)
+
+    def write_raw(self, topic: str, cdr_bytes: bytes | memoryview, time_ns: int) -> None:
+        """Write a serialised message with its time [ns]."""
+        self._writer.write(self._connection(topic), time_ns, cdr_bytes)
+
+    def flush(self) -> None:
+        """Hand everything so far to the operating system: it then survives the end of this process."""
+        self._storage.flush()
+
+    @property
+    def _storage(self) -> ChecksummedMcap:
+        storage = self._writer.storage
+        assert isinstance(storage, ChecksummedMcap)
+        return storage
+
+    def _connection(self, topic: str) -> Connection:
+        try:
+            return self._topics[topic]
+        except KeyError:
+            names = ", ".join(self._topics) or "none"
+            raise BagError(f"topic {topic} was not added to {self.path}; added are {names}") from None
+
+
+class BagReader:
+    """Reads a bag folder or a bare `.mcap`, whole, cut or damaged; a context manager.
+
+    `topics` maps names to types, `details` to types, quality of service and definitions, `metadata` is the
+    bag's own (custom data). What is damaged is left out and named, one line each, in the log and in `losses`.
+    Raises BagError where there is no bag, or not one that can be read.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = Path(path)
+        self.metadata: dict[str, str] = {}
+        self._stores: dict[str, Typestore] = {}
+        self._has_header: dict[str, bool] = {}
+        self._files: list[McapFile] = []
+        self._missing: list[str] = []
+        try:
+            for file in self._locate():
+                self._files.append(McapFile(file))
+        except BaseException:
+            self.close()
+            raise
+        self._note_metadata()
+        self.details = self._read_details()
+        self.topics = {name: topic.msgtype for name, topic in self.details.items()}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files of the bag."""
+        for file in self._files:
+            file.close()
+
+    def count(self, topics: Collection[str] | None = None) -> int | None:
+        """Return the number of messages of `topics`, as the index tells it; None where there is none."""
+        counts = [file.counts for file in self._files]
+        if any(count is None for count in counts):
+            return None
+        wanted = self.topics if topics is None else topics
+        return sum(count[topic] for count in counts if count is not None for topic in wanted)
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """One line for each part that could not be read so far; complete once all messages have been read."""
+        return (*self._missing, *(line for file in self._files for line in file.losses))
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Yield the messages of `topics` (all by default), by recorded time.
+
+        Raises BagError for a topic that the bag does not have.
+        """
+        if unknown := sorted(set(topics or ()) - set(self.topics)):
+            names = ", ".join(sorted(self.topics)) or "none"
+            raise BagError(f"{self.path} has no topic {', '.join(unknown)}; it has {names}")
+        return self._messages(None if topics is None else frozenset(topics))
+
+    def deserialize(self, message: BagMessage) -> Any:
+        """Return a message of this bag as an object with the message's fields.
+
+        Raises BagError where its encoding or definition is unknown, or the bytes do not fit the definition.
+        """
+        topic = self.details[message.topic]
+        if topic.encoding != "cdr":
+            raise BagError(f"{message.topic} is serialised as '{topic.encoding}'; only cdr can be read")
+        store = self._store(message.msgtype, topic.definition)
+        try:
+            return store.deserialize_cdr(message.data, message.msgtype)
+        except Exception as error:  # rosbags' generated code fails in many ways on bytes that do not fit
+            reason = str(error) or type(error).__name__
+            raise BagError(f"a {message.msgtype} on {message.topic} cannot be read: {reason}") from None
+
+    def stamp_ns(self, message: BagMessage) -> int | None:
+        """Return the stamp [ns] of the message's header, without reading the rest; None where it has none."""
+        topic = self.details[message.topic]
+        if topic.encoding != "cdr" or len(message.data) < _STAMP_END:
+            return None
+        if message.msgtype not in self._has_header:
+            fields = self._store(message.msgtype, topic.definition).fielddefs[message.msgtype][1]
+            self._has_header[message.msgtype] = fields[0] == _HEADER_FIELD
+        if not self._has_header[message.msgtype]:
+            return None
+        # CDR: one byte, then the order of bytes (odd: little endian), options, and the message itself.
+        seconds, nanoseconds = struct.unpack_from("<iI" if message.data[1] & 1 else ">iI", message.data, 4)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+    def _messages(self, topics: frozenset[str] | None) -> Iterator[BagMessage]:
+        for entry in in_time_order(self._files, topics):
+            yield BagMessage(entry.topic, full_name(entry.schema_name), entry.time_ns, entry.data)
+
+    def _locate(self) -> list[Path]:
+        if not self.path.is_dir():
+            if flaw := missing_bag(self.path):
+                raise BagError(flaw)
+            return [self.path]
+        information = self._information()
+        named = information.get("relative_file_paths")
+        names = [Path(str(name)).name for name in named] if isinstance(named, list) else []
+        files = [self.path / name for name in dict.fromkeys(names)]
+        self._missing += [f"{file.name} is missing" for file in files if not file.exists()]
+        files = [file for file in files if file.exists()] or mcap_files(self.path)
+        if not files:
+            raise BagError(missing_bag(self.path) or f"{self.path} holds no file of its bag")
+        custom = information.get("custom_data")
+        if isinstance(custom, dict):
+            self.metadata.update({str(key): str(value) for key, value in custom.items()})
+        return files
+
+    def _information(self) -> dict[str, Any]:
+        """Return what metadata.yaml says; nothing where a recorder was killed before it wrote any."""
+        path = self.path / "metadata.yaml"
+        if not os.path.lexists(path):
+            return {}
+        try:
+            information = read_yaml(path)["rosbag2_bagfile_information"]
+            storage, mode = information["storage_identifier"], information.get("compression_mode") or "none"
+            mode = mode.lower()
+        except (FileError, LookupError, TypeError, AttributeError):
+            self._missing.append("metadata.yaml is damaged; read without it")
+            return {}
+        if storage != "mcap":
+            raise BagError(f"{self.path} is stored as {storage}; {_CONVERT}")
+        if mode != "none":
+            raise BagError(f"{self.path} is compressed by {mode}; {_CONVERT}")
+        return dict(information)
+
+    def _note_metadata(self) -> None:
+        for file in self._files:
+            for key, value in file.metadata.get(METADATA_RECORD, {}).items():
+                self.metadata.setdefault(key, value)
+
+    def _read_details(self) -> dict[str, Topic]:
+        details: dict[str, Topic] = {}
+        for file in self._files:
+            for channel in file.channels.values():
+                schema = file.schemas.get(channel.schema_id)
+                offered = qos_profiles.parse(channel.metadata.get("offered_qos_profiles", ""))
+                known = details.get(channel.topic) or Topic(
+                    msgtype=full_name(schema.name) if schema else "",
+                    qos=(),
+                    encoding=channel.message_encoding,
+                    definition=schema.data.decode(errors="replace") if schema else "",
+                    type_hash=channel.metadata.get("topic_type_hash", ""),
+                )
+                details[channel.topic] = known._replace(qos=tuple(dict.fromkeys((*known.qos, *offered))))
+        return details
+
+    def _store(self, msgtype: str, definition: str) -> Typestore:
+        """Return a store with the type as the bag defines it, or as Jazzy does where the bag does not."""
+        if not definition:
+            known_type(msgtype)
+            return typestore()
+        if msgtype not in self._stores:
+            store = get_typestore(Stores.EMPTY)
+            is_idl = definition.startswith("=" * 80 + "\nIDL: ")
+            try:
+                store.register(
+                    get_types_from_idl(definition) if is_idl else get_types_from_msg(definition, msgtype)
+                )
+            except TypesysError as error:
+                reason = str(error).partition("\n")[0]
+                raise BagError(f"{self.path}: the definition of {msgtype} cannot be read: {reason}") from None
+            self._stores[msgtype] = store
+        return self._stores[msgtype]

@@ -1,0 +1,1 @@
+"""Nodes and commands: base node, parameters and their rules, command lines, start and stop."""

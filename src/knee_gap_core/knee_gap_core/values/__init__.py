@@ -1,0 +1,1 @@
+"""Values that pass between packages: poses, edges, estimates, rigid transforms."""

@@ -1,0 +1,113 @@
+"""The pose of the lens at the stamp of an image, foretold where the tracker has not come so far yet.
+
+An image may be looked at before the tracker's next pose arrives. What is foretold only guides the search
+for the points in the image, so a pose with a larger, honest covariance is better than none.
+"""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.pose_continuity import PoseContinuity
+from knee_gap_core.values.poses import LensPose
+
+POSES = 3  # through which the motion is drawn
+KEPT = 512  # poses: half a second of the fastest tracker, longer than an image is on its way
+LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion, and beyond the last
+ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
+ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
+
+
+class LensPosePredictor:
+    """Takes lens poses in the order of their stamps and tells the pose at a stamp near the last of them."""
+
+    def __init__(self, longest_step_ns: int = LONGEST_STEP_NS) -> None:
+        """`longest_step_ns`: the longest time between poses, and from the last to the stamp asked for."""
+        self._longest_step_ns = longest_step_ns
+        self._poses: deque[LensPose] = deque(maxlen=KEPT)
+        self._continuity = PoseContinuity()
+
+    @property
+    def break_reason(self) -> str:
+        """Why the latest segment of poses began; empty for the first."""
+        return self._continuity.reason
+
+    def add(self, pose: LensPose) -> None:
+        """Take the next pose; one of another frame, or from before the last, starts anew."""
+        if self._poses:
+            last = self._poses[-1]
+            if pose.frame_id != last.frame_id or pose.stamp_ns <= last.stamp_ns:
+                self._poses.clear()
+        segment = self._continuity.take(
+            pose.stamp_ns, pose.frame_id, pose.position, pose.quaternion_xyzw, pose.covariance
+        )
+        self._poses.append(replace(pose, segment=segment))
+
+    def clear(self) -> None:
+        """Forget all poses; their segments are numbered on."""
+        self._poses.clear()
+
+    def segment_at(self, stamp_ns: int) -> int | None:
+        """Segment of the latest pose up to a stamp [ns]; None where no pose is as old.
+
+        Poses of one segment follow from each other as those of a hand do, see `pose_continuity`.
+        """
+        segments = (pose.segment for pose in reversed(self._poses) if pose.stamp_ns <= stamp_ns)
+        return next(segments, None)
+
+    def expects_after(self, stamp_ns: int) -> bool:
+        """Whether a pose after a stamp [ns] is still to come, from a tracker that has not fallen silent."""
+        if not self._poses:
+            return False
+        return 0 < stamp_ns - self._poses[-1].stamp_ns <= self._longest_step_ns
+
+    def at(self, stamp_ns: int) -> LensPose | None:
+        """The pose at a stamp [ns] with its covariance; None where no poses are close enough."""
+        near = self._motion(stamp_ns)
+        if (
+            len(near) < 2
+            or stamp_ns - near[-1].stamp_ns > self._longest_step_ns
+            or stamp_ns < near[0].stamp_ns
+        ):
+            return None
+        times = np.array([pose.stamp_ns - stamp_ns for pose in near]) / 1e9
+        # Value at time 0 of the line through the poses, as weights of the poses.
+        centred = times - times.mean()
+        weights = 1.0 / len(near) - times.mean() * centred / (centred @ centred)
+        reference = Rotation.from_quat(near[-1].quaternion_xyzw)
+        turns = np.stack(
+            [(Rotation.from_quat(p.quaternion_xyzw) * reference.inv()).as_rotvec() for p in near]
+        )
+        # A constant acceleration a adds a t^2 / 2 to each pose.
+        bend = abs(float(weights @ times**2)) / 2.0
+        curved = np.repeat([ACCELERATION, ANGULAR_ACCELERATION], 3) * bend
+        noise: Array = np.einsum("k,kij->ij", weights**2, np.stack([pose.covariance for pose in near]))
+        return LensPose(
+            stamp_ns=stamp_ns,
+            frame_id=near[-1].frame_id,
+            child_frame_id=near[-1].child_frame_id,
+            position=weights @ np.stack([pose.position for pose in near]),
+            quaternion_xyzw=(Rotation.from_rotvec(weights @ turns) * reference).as_quat(),
+            covariance=noise + np.diag(curved**2 / 3.0),
+        )
+
+    def _motion(self, stamp_ns: int) -> list[LensPose]:
+        """The poses that describe the motion around a stamp, up to the first that follows it."""
+        end = len(self._poses)
+        while end > 1 and self._poses[end - 2].stamp_ns >= stamp_ns:
+            end -= 1
+        if end == 0:
+            return []
+        # Between two poses those two tell most; beyond the last, more of them level the noise.
+        wanted = 2 if self._poses[end - 1].stamp_ns >= stamp_ns else POSES
+        motion = [self._poses[end - 1]]
+        for index in range(end - 2, max(end - 1 - wanted, -1), -1):
+            if motion[0].stamp_ns - self._poses[index].stamp_ns > self._longest_step_ns:
+                break
+            if motion[0].segment != self._poses[index].segment:
+                break
+            motion.insert(0, self._poses[index])
+        return motion

@@ -1,0 +1,85 @@
+"""Poses as values: a body that the tracker follows, and the lens that is fixed to it."""
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from knee_gap_core.values.arrays import Array
+
+# No tracker sees farther [m]; what lies beyond is no place, and its square may be no number.
+FARTHEST = 1000.0
+UNIT_TOLERANCE = 1e-3  # [-] by which a quaternion's length may differ from 1
+
+
+@dataclass(frozen=True, eq=False)
+class BodyPose:
+    """One tracked rigid body at one exposure of the tracker's cameras.
+
+    `position` (3,) [m] and `quaternion_xyzw` (4,) map body coordinates to the tracker's frame.
+    `tracking_valid` is the tracker's own word on whether it sees the body; `mean_error` the mean residual of
+    its markers [m], NaN where the tracker does not tell. `stamp_ns` is the time of exposure, or of arrival
+    where `stamp_is_arrival` says so. Nothing here is checked: `pose_validity` does that.
+    """
+
+    stamp_ns: int
+    position: Array
+    quaternion_xyzw: Array
+    name: str = ""
+    tracking_valid: bool = True
+    mean_error: float = nan
+    stamp_is_arrival: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LensPose:
+    """Pose of the lens, with its error: the fields of geometry_msgs/PoseWithCovarianceStamped.
+
+    `position` (3,) [m] and `quaternion_xyzw` (4,) map coordinates of `child_frame_id` (z along the view, x to
+    the right, y down) to `frame_id`. `covariance` (6, 6) is that of position [m^2] and of a small rotation
+    [rad^2] about the fixed axes of `frame_id`, in the order x, y, z, rotation about x, y, z (REP-103).
+    `scope_rotation` [rad] is how far the scope is turned in its camera head since its calibration. `segment`
+    counts the breaks in the poses before it, where somebody follows them: see `pose_continuity`.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    position: Array
+    quaternion_xyzw: Array
+    covariance: Array
+    scope_rotation: float = 0.0
+    segment: int = 0
+
+    def matrix(self) -> Array:
+        """Return the pose as `T_world_lens` (4, 4), which maps lens coordinates to `frame_id`."""
+        return rigid_transform(self.position, self.quaternion_xyzw)
+
+
+def rigid_transform(position: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> Array:
+    """4x4 matrix of a position (3,) and a quaternion (4,), which is brought to unit length."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+def is_unit(quaternion: Array) -> bool:
+    """Whether a quaternion (4,) is of unit length, within what rounding and drivers leave."""
+    # Compared before it is squared, which overflows.
+    if not np.abs(quaternion).max() <= 2.0:
+        return False
+    return abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT_TOLERANCE
+
+
+def is_place(position: Array) -> bool:
+    """Whether a position (3,) [m] is finite, and not farther than any tracker sees."""
+    return bool(np.abs(position).max() <= FARTHEST)
+
+
+def cross_matrix(vector: Array) -> Array:
+    """Matrix (3, 3) whose product with v is the cross product of `vector` and v."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

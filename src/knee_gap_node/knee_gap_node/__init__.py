@@ -1,1 +1,0 @@
-"""What every node shares: parameters from a dataclass, QoS by purpose, diagnostics, start and stop."""

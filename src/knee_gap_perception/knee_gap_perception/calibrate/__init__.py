@@ -1,0 +1,1 @@
+"""The command `calibrate`: from a recording to a calibration file."""

@@ -1,0 +1,1 @@
+"""Measurements taken from a recording: boards, image motion, poses."""

@@ -1,0 +1,1 @@
+"""Estimators of the calibration: intrinsics, hand-eye, pivot, clock."""

@@ -1,0 +1,1 @@
+"""Camera models: projection, intrinsics, errors of bearings, agreement of two models."""

@@ -1,0 +1,431 @@
+"""Camera models: pixels of the image to directions in the optical frame, and back.
+
+Pixels are (column, row), (0, 0) the centre of the first pixel. The optical frame is REP-103's: z along the
+view, x to the right, y down. A pixel or a direction that a model does not describe gives NaN, never a guess.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_perception.errors import PerceptionError
+
+# Coefficients, focal lengths and centres beyond this [-, px] are no camera's, and overflow when multiplied.
+LARGEST_NUMBER = 1e6
+SHORTEST_FOCAL = 1e-3  # [px]
+PIXEL_TOLERANCE = 1e-6  # [px] what a pixel may move when it is taken to a direction and back
+NO_TERM = 1e-30  # [-] of a polynomial's largest term, below which another is none
+TABLE_SIZE = 2048  # samples of a distortion curve, from which its inverse starts
+
+
+class Camera(Protocol):
+    """What the rest of the package asks of a camera."""
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the image."""
+
+    @property
+    def height_px(self) -> int:
+        """Rows of the image."""
+
+    def bearings(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors (..., 3) seen at pixels (..., 2); NaN outside the model."""
+
+    def pixels(self, bearings: npt.ArrayLike) -> Array:
+        """Pixels (..., 2) at which directions (..., 3) of any length are seen; NaN outside the model."""
+
+    def radians_per_pixel(self, pixel: npt.ArrayLike) -> float:
+        """Angle [rad] that one pixel spans at a pixel (2,), along the coarser direction; NaN outside."""
+
+
+def bearing_jacobian(camera: Camera, pixel: npt.ArrayLike) -> Array:
+    """Change of the bearing with the pixel (3, 2) [1/px] at a pixel (2,), by central differences."""
+    u, v = np.asarray(pixel, dtype=np.float64)
+    step = 0.25
+    b = camera.bearings([[u + step, v], [u - step, v], [u, v + step], [u, v - step]])
+    jacobian: Array = np.stack([b[0] - b[1], b[2] - b[3]], axis=1) / (2 * step)
+    return jacobian
+
+
+class _Coarseness:
+    """The angle of a pixel, the same for every model."""
+
+    def radians_per_pixel(self: Camera, pixel: npt.ArrayLike) -> float:
+        """Angle [rad] that one pixel spans at a pixel (2,), along the coarser direction; NaN outside."""
+        jacobian = bearing_jacobian(self, pixel)
+        if not np.isfinite(jacobian).all():
+            return float("nan")
+        return float(np.linalg.norm(jacobian, ord=2))
+
+
+def _check_size(width_px: int, height_px: int) -> None:
+    if width_px < 1 or height_px < 1:
+        raise PerceptionError(f"an image must have at least 1x1 px, not {width_px}x{height_px} px")
+
+
+def _check_matrix(fx: float, fy: float, cx: float, cy: float) -> None:
+    if not np.isfinite([fx, fy, cx, cy]).all():
+        raise PerceptionError(f"the camera matrix must be finite, not fx={fx}, fy={fy}, cx={cx}, cy={cy} px")
+    if fx <= 0 or fy <= 0:
+        raise PerceptionError(
+            f"focal lengths must be above 0 px, not fx={fx}, fy={fy} px (0 stands for an uncalibrated camera)"
+        )
+    if min(fx, fy) < SHORTEST_FOCAL or max(np.abs([fx, fy, cx, cy])) > LARGEST_NUMBER:
+        raise PerceptionError(
+            f"the camera matrix must hold focal lengths in [{SHORTEST_FOCAL:g}, {LARGEST_NUMBER:g}] px and a "
+            f"centre within {LARGEST_NUMBER:g} px, not fx={fx}, fy={fy}, cx={cx}, cy={cy} px"
+        )
+
+
+def _coefficients(distortion: Sequence[float], allowed: tuple[int, ...], model: str) -> tuple[float, ...]:
+    values = tuple(float(value) for value in distortion)
+    if len(values) not in allowed:
+        choices = ", ".join(map(str, allowed))
+        raise PerceptionError(f"{model} takes {choices} distortion coefficients, not {len(values)}")
+    if not np.isfinite(values).all():
+        raise PerceptionError(f"distortion coefficients must be finite, not {values}")
+    if any(abs(value) > LARGEST_NUMBER for value in values):
+        raise PerceptionError(
+            f"distortion coefficients must lie within {LARGEST_NUMBER:g} of 0, not {values}"
+        )
+    return values
+
+
+def _first_positive_root(coefficients: npt.ArrayLike, limit: float) -> float:
+    """Smallest positive real root of a polynomial, highest power first; `limit` where none is below it."""
+    polynomial = np.asarray(coefficients, dtype=np.float64)
+    # A term that changes nothing below the limit is left out: its roots lie beyond every number.
+    terms = np.abs(polynomial) * limit ** np.arange(len(polynomial) - 1, -1, -1)
+    polynomial = np.where(terms > NO_TERM * terms.max(), polynomial, 0.0)
+    roots = np.roots(polynomial)
+    real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
+    return float(min(real.min(initial=limit), limit))
+
+
+@dataclass(frozen=True)
+class EquiangularCamera(_Coarseness):
+    """The paper's model: every pixel spans the same angle, its degrees per pixel DPP (section II-E).
+
+    Columns count azimuth about the y axis, rows elevation from the x-z plane:
+    bearing = (sin az cos el, sin el, cos az cos el). DPP = field / size in each direction; the paper prints
+    0.075 deg/px for 90 / 1280, which is 0.0703.
+
+    Raises PerceptionError for an empty image or a field outside (0, 2 pi] in azimuth or (0, pi] in elevation.
+    """
+
+    width_px: int
+    height_px: int
+    field_azimuth: float = np.pi / 2
+    field_elevation: float = np.pi / 2
+
+    def __post_init__(self) -> None:
+        _check_size(self.width_px, self.height_px)
+        if not 0 < self.field_azimuth <= 2 * np.pi or not 0 < self.field_elevation <= np.pi:
+            raise PerceptionError(
+                "the field of view must lie in (0, 2 pi] rad in azimuth and (0, pi] rad in elevation, "
+                f"not {self.field_azimuth} and {self.field_elevation} rad"
+            )
+
+    @property
+    def _scale(self) -> Array:
+        """Radians per pixel of column and row (2,)."""
+        return np.array([self.field_azimuth / self.width_px, self.field_elevation / self.height_px])
+
+    @property
+    def _centre(self) -> Array:
+        return np.array([(self.width_px - 1) / 2, (self.height_px - 1) / 2])
+
+    def bearings(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors (..., 3) seen at pixels (..., 2); NaN beyond a half turn."""
+        angles = (np.asarray(pixels, dtype=np.float64) - self._centre) * self._scale
+        azimuth, elevation = angles[..., 0], angles[..., 1]
+        bearing = np.stack(
+            [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)],
+            axis=-1,
+        )
+        inside = (np.abs(azimuth) < np.pi) & (np.abs(elevation) < np.pi / 2)
+        return np.where(inside[..., None], bearing, np.nan)
+
+    def pixels(self, bearings: npt.ArrayLike) -> Array:
+        """Pixels (..., 2) at which directions (..., 3) are seen; NaN straight up and down."""
+        x, y, z = np.moveaxis(np.asarray(bearings, dtype=np.float64), -1, 0)
+        level = np.hypot(x, z)
+        angles = np.stack([np.arctan2(x, z), np.arctan2(y, level)], axis=-1)
+        return np.where((level > 0)[..., None], angles / self._scale + self._centre, np.nan)
+
+
+@dataclass(frozen=True)
+class PinholeCamera(_Coarseness):
+    """OpenCV's pinhole model, CameraInfo's `plumb_bob` and `rational_polynomial`.
+
+    It takes no, 4, 5 or 8 distortion coefficients, or 12 with the thin prism. Directions at or behind the
+    image plane, and beyond the radius at which the distortion folds back on itself, are outside the model.
+
+    Raises PerceptionError for a size, matrix or coefficients that break the model's rules.
+    """
+
+    width_px: int
+    height_px: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    fold_radius: float = field(init=False, repr=False, default=np.inf)
+
+    def __post_init__(self) -> None:
+        _check_size(self.width_px, self.height_px)
+        _check_matrix(self.fx, self.fy, self.cx, self.cy)
+        given = _coefficients(self.distortion, (0, 4, 5, 8, 12), "the pinhole model")
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = given + (0.0,) * (12 - len(given))
+        object.__setattr__(self, "distortion", given)
+        object.__setattr__(self, "_numerator", np.array([k3, 0, k2, 0, k1, 0, 1]))
+        object.__setattr__(self, "_denominator", np.array([k6, 0, k5, 0, k4, 0, 1]))
+        object.__setattr__(self, "_tangential", (p1, p2, s1, s2, s3, s4))
+        object.__setattr__(self, "fold_radius", self._find_fold())
+
+    _numerator: Array = field(init=False, repr=False, compare=False)
+    _denominator: Array = field(init=False, repr=False, compare=False)
+    _tangential: tuple[float, ...] = field(init=False, repr=False, compare=False)
+
+    def _find_fold(self) -> float:
+        """Radius on the plane z = 1 at which the radial distortion stops growing, or 20 (87 degrees)."""
+        curve = np.polymul([1.0, 0.0], self._numerator)
+        slope = np.polysub(
+            np.polymul(np.polyder(curve), self._denominator), np.polymul(curve, np.polyder(self._denominator))
+        )
+        limit = _first_positive_root(self._denominator, limit=20.0)
+        return _first_positive_root(slope, limit=limit)
+
+    def _radial(self, r: Array) -> Array:
+        return np.asarray(np.polyval(self._numerator, r) / np.polyval(self._denominator, r))
+
+    def _distort(self, plane: Array) -> Array:
+        """Points of the plane z = 1 (..., 2) where the distorting lens puts them."""
+        x, y = plane[..., 0], plane[..., 1]
+        p1, p2, s1, s2, s3, s4 = self._tangential
+        r2 = x * x + y * y
+        radial = self._radial(np.sqrt(r2))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2,
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2,
+            ],
+            axis=-1,
+        )
+
+    def _undistort(self, target: Array) -> Array:
+        """The inverse of `_distort`, by Newton's method from the inverse of the radial part alone."""
+        radius = np.linspace(0.0, self.fold_radius, TABLE_SIZE)
+        length = np.linalg.norm(target, axis=-1, keepdims=True)
+        start = np.interp(length, radius * self._radial(radius), radius)
+        plane = target * np.divide(start, length, out=np.ones_like(length), where=length > 0)
+        h = 1e-6
+        right, down = np.array([h, 0.0]), np.array([0.0, h])
+        for _ in range(6):
+            dx = (self._distort(plane + right) - self._distort(plane - right)) / (2 * h)
+            dy = (self._distort(plane + down) - self._distort(plane - down)) / (2 * h)
+            error = self._distort(plane) - target
+            determinant = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+            determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)
+            step_x = (error[..., 0] * dy[..., 1] - error[..., 1] * dy[..., 0]) / determinant
+            step_y = (error[..., 1] * dx[..., 0] - error[..., 0] * dx[..., 1]) / determinant
+            plane = plane - np.stack([step_x, step_y], axis=-1)
+        return np.asarray(plane)
+
+    def bearings(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors (..., 3) seen at pixels (..., 2); NaN outside the model."""
+        focal = np.array([self.fx, self.fy])
+        target = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / focal
+        plane = self._undistort(target) if any(self.distortion) else target
+        inside = np.linalg.norm(plane, axis=-1) < self.fold_radius
+        inside &= (np.abs(self._distort(plane) - target) * focal < PIXEL_TOLERANCE).all(axis=-1)
+        ray = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+        unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        return np.where(inside[..., None], unit, np.nan)
+
+    def pixels(self, bearings: npt.ArrayLike) -> Array:
+        """Pixels (..., 2) at which directions (..., 3) are seen; NaN outside the model."""
+        ray = np.asarray(bearings, dtype=np.float64)
+        depth = np.where(ray[..., 2] > 0, ray[..., 2], np.nan)
+        plane = ray[..., :2] / depth[..., None]
+        plane = np.where((np.linalg.norm(plane, axis=-1) < self.fold_radius)[..., None], plane, np.nan)
+        return self._distort(plane) * [self.fx, self.fy] + [self.cx, self.cy]
+
+
+@dataclass(frozen=True)
+class FisheyeCamera(_Coarseness):
+    """OpenCV's fisheye (Kannala-Brandt) model, CameraInfo's `equidistant`.
+
+    The radius in the image is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), theta the angle
+    from the optical axis. Unlike OpenCV's own functions it holds beyond 90 degrees from the axis; angles of a
+    half turn, or beyond the one at which the polynomial folds back, are outside the model.
+
+    Raises PerceptionError for a size, matrix or coefficients that break the model's rules.
+    """
+
+    width_px: int
+    height_px: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    fold_angle: float = field(init=False, repr=False, default=np.pi)
+
+    def __post_init__(self) -> None:
+        _check_size(self.width_px, self.height_px)
+        _check_matrix(self.fx, self.fy, self.cx, self.cy)
+        given = _coefficients(self.distortion, (4,), "the fisheye model")
+        k1, k2, k3, k4 = given
+        object.__setattr__(self, "distortion", given)
+        slope = [9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1]
+        object.__setattr__(self, "fold_angle", _first_positive_root(slope, limit=np.pi))
+
+    def _radius(self, theta: Array) -> Array:
+        k1, k2, k3, k4 = self.distortion
+        t2 = theta * theta
+        return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+    def _angle(self, radius: Array) -> Array:
+        """Inverse of `_radius`, by Newton's method from a table."""
+        if not any(self.distortion):
+            return radius
+        table = np.linspace(0.0, self.fold_angle, TABLE_SIZE)
+        theta = np.interp(radius, self._radius(table), table)
+        k1, k2, k3, k4 = self.distortion
+        for _ in range(4):
+            t2 = theta * theta
+            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            slope = np.where(np.abs(slope) < 1e-9, np.nan, slope)
+            theta = theta - (self._radius(theta) - radius) / slope
+        return theta
+
+    def bearings(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors (..., 3) seen at pixels (..., 2); NaN outside the model."""
+        plane = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        radius = np.linalg.norm(plane, axis=-1)
+        theta = self._angle(radius)
+        inside = (theta >= 0) & (theta < self.fold_angle)
+        inside &= np.abs(self._radius(theta) - radius) * max(self.fx, self.fy) < PIXEL_TOLERANCE
+        sine_per_radius = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
+        unit = np.concatenate([plane * sine_per_radius[..., None], np.cos(theta)[..., None]], axis=-1)
+        return np.where(inside[..., None], unit, np.nan)
+
+    def pixels(self, bearings: npt.ArrayLike) -> Array:
+        """Pixels (..., 2) at which directions (..., 3) are seen; NaN outside the model."""
+        ray = np.asarray(bearings, dtype=np.float64)
+        side = np.linalg.norm(ray[..., :2], axis=-1)
+        theta = np.arctan2(side, ray[..., 2])
+        inside = (theta < self.fold_angle) & ((side > 0) | (ray[..., 2] > 0))
+        ratio = np.divide(self._radius(theta), side, out=np.zeros_like(side), where=side > 0)
+        plane = ray[..., :2] * ratio[..., None]
+        return np.where(inside[..., None], plane * [self.fx, self.fy] + [self.cx, self.cy], np.nan)
+
+
+def refracted(bearings: npt.ArrayLike, index_ratio: float) -> Array:
+    """Unit vectors (..., 3) after a window across the z axis of rays along directions (..., 3) of any length.
+
+    `index_ratio` is the sine of the angle after the window to that before it. NaN for directions along or
+    against the window and for rays that it reflects totally.
+    """
+    ray = np.asarray(bearings, dtype=np.float64)
+    length = np.linalg.norm(ray, axis=-1, keepdims=True)
+    side = index_ratio * ray[..., :2] / np.where(length > 0, length, np.nan)
+    square = 1.0 - (side * side).sum(axis=-1, keepdims=True)
+    passes = (square > 0) & (ray[..., 2:] > 0)
+    ahead = np.sqrt(np.where(passes, square, np.nan))
+    return np.concatenate([np.where(passes, side, np.nan), ahead], axis=-1)
+
+
+@dataclass(frozen=True)
+class RefractedCamera(_Coarseness):
+    """A camera of any model, calibrated in one medium and used in another, behind a flat window.
+
+    The window is perpendicular to the view, and the pupil close behind it: a pixel keeps its azimuth about
+    the z axis, and sin(angle in use) = `index_ratio` * sin(angle of `camera`), with the ratio of the
+    refractive indices n_calibration / n_use. Rays that meet no window, or that it reflects totally, are
+    outside the model. Raises PerceptionError for a ratio that is not a positive number.
+    """
+
+    camera: Camera
+    index_ratio: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.index_ratio < np.inf:
+            raise PerceptionError(
+                f"the ratio of refractive indices must be above 0 and finite, not {self.index_ratio}"
+            )
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the image."""
+        return self.camera.width_px
+
+    @property
+    def height_px(self) -> int:
+        """Rows of the image."""
+        return self.camera.height_px
+
+    def bearings(self, pixels: npt.ArrayLike) -> Array:
+        """Unit vectors (..., 3) in use seen at pixels (..., 2); NaN outside the model."""
+        return refracted(self.camera.bearings(pixels), self.index_ratio)
+
+    def pixels(self, bearings: npt.ArrayLike) -> Array:
+        """Pixels (..., 2) at which directions (..., 3) in use are seen; NaN outside the model."""
+        return self.camera.pixels(refracted(bearings, 1.0 / self.index_ratio))
+
+
+def camera_in_medium(camera: Camera, index_ratio: float) -> Camera:
+    """The camera where the sine of an angle is `index_ratio` times the calibrated one: itself for 1."""
+    return camera if index_ratio == 1.0 else RefractedCamera(camera, index_ratio)
+
+
+class CameraInfo(Protocol):
+    """The fields of sensor_msgs/CameraInfo that are read, of ROS's own class or any other."""
+
+    height: int
+    width: int
+    distortion_model: str
+    d: Sequence[float]
+    k: Sequence[float]
+
+
+MODELS: dict[str, Callable[..., Camera]] = {
+    "plumb_bob": PinholeCamera,
+    "rational_polynomial": PinholeCamera,
+    "equidistant": FisheyeCamera,
+    "fisheye": FisheyeCamera,
+}
+
+
+def camera_from_info(info: CameraInfo) -> Camera:
+    """The camera that a sensor_msgs/CameraInfo describes.
+
+    Raises PerceptionError for an unknown distortion model, an uncalibrated camera, and images that are binned
+    or cut out of a larger one.
+    """
+    if info.distortion_model not in MODELS:
+        choices = ", ".join(MODELS)
+        raise PerceptionError(
+            f"camera_info's distortion_model must be one of {choices}, not '{info.distortion_model}'"
+        )
+    if max(getattr(info, "binning_x", 0), getattr(info, "binning_y", 0)) > 1:
+        raise PerceptionError(f"camera_info must not be binned, but has {info.binning_x}x{info.binning_y}")  # type: ignore[attr-defined]
+    roi = getattr(info, "roi", None)
+    if roi is not None and (roi.x_offset, roi.y_offset) != (0, 0):
+        raise PerceptionError(
+            "camera_info must describe the whole image, but its region starts at "
+            f"({roi.x_offset}, {roi.y_offset}) px"
+        )
+    k = np.asarray(info.k, dtype=np.float64)
+    if k.shape != (9,):
+        raise PerceptionError(f"camera_info's k must have 9 entries, not {k.size}")
+    fx, fy, cx, cy = float(k[0]), float(k[4]), float(k[2]), float(k[5])
+    model = MODELS[info.distortion_model]
+    return model(int(info.width), int(info.height), fx, fy, cx, cy, tuple(float(value) for value in info.d))

@@ -1,0 +1,1 @@
+"""Error of predicted gap masks against marked ones."""

@@ -1,0 +1,1 @@
+"""Detection of the instrument gap in one image, and the confidence in it."""

@@ -1,0 +1,155 @@
+"""The section of the gap through which an instrument would pass, and the edges on either side of it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from knee_gap_core.values.arrays import Array, Image, Mask
+from knee_gap_perception.gap_detection.border_sharpness import border_sharpness
+from knee_gap_perception.image.field_of_view import FieldOfView
+
+DIRECTIONS = 36  # across the gap, over half a turn
+SMOOTHED = 4  # directions to either side over which widths are levelled
+STEP = 0.5  # [px at working size] between the samples of a ray
+TISSUE_BEYOND = 6  # [px at working size] of tissue that must follow an edge
+CANDIDATES = 4  # dark parts looked at, largest first
+
+
+@dataclass(frozen=True)
+class Section:
+    """The largest inscribed disc (centre [px], radius [px]) and the two edges across it (2, 2) [px].
+
+    `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,)
+    the step over each edge against the tissue's; `sharpness` (2,) that of the border on either side
+    (`border_sharpness`). Lengths are in pixels of the full image.
+    """
+
+    centre: Array
+    radius: float
+    edges: Array
+    contrast: Array
+    levels: Array
+    sharpness: Array
+
+    @property
+    def across(self) -> Array:
+        """Unit vector (2,) in the image from edge 0 to edge 1."""
+        span = self.edges[1] - self.edges[0]
+        return np.asarray(span / np.linalg.norm(span))
+
+
+def find_section(
+    dark: Mask, value: Image, foreign: Mask, field: FieldOfView, scale: float, region: tuple[Array, float]
+) -> Section | None:
+    """The best section through the dark pixels; None where no dark part has tissue on both sides.
+
+    `dark`, `value` (brightness) and `foreign` (what is no tissue) are (h, w) at working size, `scale` times
+    the full one; `region` is the centre [px] and radius [px] of the region of interest in the full image,
+    in which the disc's centre must lie. Of several dark parts the one with the largest disc is taken, discs
+    nearer the region's centre preferred.
+    """
+    opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")[:CANDIDATES]
+    rows, columns = np.ogrid[0 : dark.shape[0], 0 : dark.shape[1]]
+    centre_small = (region[0] + 0.5) * scale - 0.5
+    away2 = ((columns - centre_small[0]) ** 2 + (rows - centre_small[1]) ** 2) / (region[1] * scale) ** 2
+    preference = np.where(away2 <= 1.0, 1.0 - 0.8 * away2, 0.0)
+    best: tuple[float, Section] | None = None
+    for label in order if count > 1 else ():
+        # No disc in it can be larger than itself.
+        if best is not None and np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi) + 1.0 < best[0]:
+            break
+        part = (labels == label).astype(np.uint8)
+        # The padding keeps discs inside the frame.
+        distance = cv2.distanceTransform(
+            cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 5
+        )
+        score = distance[1:-1, 1:-1] * preference
+        for _ in range(3):
+            row, column = np.unravel_index(int(score.argmax()), score.shape)
+            if score[row, column] <= 1.0 or (best is not None and score[row, column] <= best[0]):
+                break
+            section = _section_through(
+                np.array([column, row], float),
+                float(distance[row + 1, column + 1]),
+                part > 0,
+                value,
+                foreign,
+                field,
+                scale,
+            )
+            if section is not None:
+                best = (float(score[row, column]), section)
+                break
+            # Tissue is missing on a side here: look elsewhere along the same part.
+            radius = max(6.0, float(distance[row + 1, column + 1]))
+            score = np.where((columns - column) ** 2 + (rows - row) ** 2 < radius**2, 0.0, score)
+    return best[1] if best is not None else None
+
+
+def _section_through(
+    centre: Array, radius: float, part: Mask, value: Image, foreign: Mask, field: FieldOfView, scale: float
+) -> Section | None:
+    """The narrowest way across the gap through a point at working size, with tissue at both ends."""
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    length = np.arange(0.0, 4.0 * radius + 20.0, STEP)
+    reach = np.empty((DIRECTIONS, 2))
+    for side, sign in enumerate((-1.0, 1.0)):
+        points = centre + sign * length[None, :, None] * directions[:, None, :]
+        column, row = np.rint(points).astype(int).transpose(2, 0, 1)
+        inside = (row >= 0) & (row < part.shape[0]) & (column >= 0) & (column < part.shape[1])
+        in_gap = inside & part[row.clip(0, part.shape[0] - 1), column.clip(0, part.shape[1] - 1)]
+        first = np.where(in_gap.all(axis=1), np.nan, (~in_gap).argmax(axis=1) * STEP)
+        beyond = centre + sign * (first[:, None] + TISSUE_BEYOND) * directions
+        full = (beyond + 0.5) / scale - 0.5
+        depth = np.where(np.isfinite(full).all(axis=1), field.depth_inside(np.nan_to_num(full)), -1.0)
+        # An instrument or glare beside the gap is not its edge.
+        column, row = np.rint(np.nan_to_num(beyond)).astype(int).T
+        tissue = ~foreign[row.clip(0, part.shape[0] - 1), column.clip(0, part.shape[1] - 1)]
+        reach[:, side] = np.where((depth > 0) & tissue, first, np.nan)
+    width = reach.sum(axis=1)
+    if not np.isfinite(width).any():
+        return None
+    narrowest = int(np.nanargmin(_smoothed(width)))
+    ends = centre + np.array([[-1.0], [1.0]]) * reach[narrowest][:, None] * directions[narrowest]
+    levels = _levels(centre, radius, ends, value)
+    contrast = (levels[1:] - levels[0]) / np.maximum(levels[1:], 1.0)
+    return Section(
+        centre=(centre + 0.5) / scale - 0.5,
+        radius=radius / scale,
+        edges=(ends + 0.5) / scale - 0.5,
+        contrast=contrast,
+        levels=levels,
+        sharpness=border_sharpness(part, centre, directions[narrowest], value, foreign, field, scale),
+    )
+
+
+def _smoothed(width: Array) -> Array:
+    """Widths over half a turn (n,) levelled over neighbouring directions; NaN stays NaN.
+
+    A nick in an edge makes one direction a little narrower than the direction across the gap.
+    """
+    turns = np.stack([np.roll(width, shift) for shift in range(-SMOOTHED, SMOOTHED + 1)])
+    known = np.isfinite(turns)
+    level = np.where(known, turns, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isfinite(width), level, np.nan)
+
+
+def _levels(centre: Array, radius: float, ends: Array, value: Image) -> Array:
+    """Median brightness of the gap's middle and of the tissue beyond each end (3,)."""
+    outward = (ends - centre) / np.linalg.norm(ends - centre, axis=1, keepdims=True)
+    beyond = ends + outward * TISSUE_BEYOND
+    places = [
+        (centre, max(1, int(0.5 * radius))),
+        (beyond[0], TISSUE_BEYOND // 2),
+        (beyond[1], TISSUE_BEYOND // 2),
+    ]
+    levels = []
+    for (x, y), half in places:
+        row, column = round(float(y)), round(float(x))
+        patch = value[max(0, row - half) : row + half + 1, max(0, column - half) : column + half + 1]
+        levels.append(float(np.median(patch)) if patch.size else 0.0)
+    return np.array(levels)

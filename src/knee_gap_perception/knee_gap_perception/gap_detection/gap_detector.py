@@ -1,0 +1,162 @@
+"""The search for the gap in one picture: segmentation, section, and the decision whether it is a gap."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from knee_gap_core.values.arrays import Array, Image, Mask
+from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.gap_detection.confidence import gap_confidence
+from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
+from knee_gap_perception.gap_detection.cross_section import Section, find_section
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
+from knee_gap_perception.image.field_of_view import FieldOfView, brightness
+from knee_gap_perception.image.instruments_and_glare import foreign_bodies
+from knee_gap_perception.segmentation.choice import segmentation_named
+
+DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
+BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
+OVEREXPOSED_SHARE = 0.7  # of the field
+
+
+class NoPointsError(Exception):
+    """Why an image gives no points: a status, and the reason in words."""
+
+    def __init__(self, status: EdgeStatus, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+class Found(NamedTuple):
+    """A section; where the picture, made smaller by `scale`, shows what is no tissue: `foreign` (h, w)."""
+
+    section: Section
+    foreign: Mask
+    scale: float
+
+
+class GapSearch:
+    """Finds the gap in pictures of one scope.
+
+    `confidence` [0, 1] is that of the last search that its dark part is a gap; NaN where it found none.
+    """
+
+    def __init__(self, parameters: EdgeParameters) -> None:
+        """Raises PerceptionError where the segmentation cannot be had (a network that cannot be read)."""
+        self.parameters = parameters
+        self.confidence = float("nan")
+        self._segmentation = segmentation_named(parameters.segmentation, **_settings(parameters))
+        self._evidence = ConfidenceFilter()
+
+    def forget(self) -> None:
+        """As if no picture had been searched."""
+        self._evidence.forget()
+
+    def mask(self, picture: Image, field: FieldOfView) -> Image:
+        """Gap of a picture (h, w, 3): 255 where it is (h, w)."""
+        small, scale = self._smaller(picture)
+        inside = field.mask((small.shape[0], small.shape[1]), scale)
+        dark = self._segmentation(small, inside & ~foreign_bodies(small))
+        size = (picture.shape[1], picture.shape[0])
+        full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        return np.where(full > 127, 255, 0).astype(np.uint8)
+
+    def foreign(self, picture: Image) -> tuple[Mask, float]:
+        """Instruments and glare (h, w) in a picture made smaller, and its scale against the full one."""
+        small, scale = self._smaller(picture)
+        return foreign_bodies(small), scale
+
+    def agreed_section(
+        self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None
+    ) -> Found:
+        """As `section`, if the images just before that of a stamp [ns] do not speak against it."""
+        try:
+            found = self.section(picture, camera, field, clicked)
+        except NoPointsError as refusal:
+            if refusal.status is EdgeStatus.NO_GAP:
+                self._evidence.add(stamp_ns, np.nan_to_num(self.confidence))
+            raise
+        confidence = self._evidence.add(stamp_ns, self.confidence)
+        if confidence < self.parameters.minimum_confidence:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the images just before showed no gap: the confidence of all is {confidence:.2f}, needed is "
+                f"{self.parameters.minimum_confidence:.2f}",
+            )
+        return found
+
+    def section(self, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None) -> Found:
+        """The section of the gap in a picture (h, w, 3), or of the one at a clicked pixel (2,).
+
+        Raises NoPointsError where the picture shows none.
+        """
+        self.confidence = float("nan")
+        small, scale = self._smaller(picture)
+        inside = field.mask(
+            (small.shape[0], small.shape[1]), scale, self.parameters.field_margin * field.extent
+        )
+        value = brightness(small)
+        light = check_light(value[inside])
+        foreign = foreign_bodies(small)
+        dark = self._segmentation(small, inside & ~foreign)
+        section = find_section(dark, value, foreign, field, scale, self._region(field, clicked))
+        if section is None:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
+            )
+        width = float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
+        if not width >= self.parameters.minimum_width:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
+                f"{np.degrees(self.parameters.minimum_width):.1f} deg",
+            )
+        confidence = self.confidence = gap_confidence(section, field.extent, light, small, dark)
+        if confidence < self.parameters.minimum_confidence:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
+                f"{self.parameters.minimum_confidence:.2f}",
+            )
+        return Found(section, foreign, scale)
+
+    def _smaller(self, picture: Image) -> tuple[Image, float]:
+        """A picture (h, w, 3) at working size, and its scale against the full one."""
+        scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
+        size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8), scale
+
+    def _region(self, field: FieldOfView, clicked: Array | None) -> tuple[Array, float]:
+        """Centre and radius [px] of the region of interest."""
+        radius = self.parameters.region_radius * field.extent
+        if clicked is not None:
+            return clicked, min(radius, 0.2 * field.extent)
+        centre = np.array(self.parameters.region_centre)
+        return np.where(np.isnan(centre), np.array(field.centre), centre), radius
+
+
+def check_light(values: Image) -> float:
+    """Brightness [grey levels] that a twentieth of some values exceeds.
+
+    Raises NoPointsError where nothing can be told in that light.
+    """
+    light = float(np.percentile(values, 95)) if values.size else 0.0
+    if light < DARK_PICTURE:
+        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
+    if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
+        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+    return light
+
+
+def _settings(parameters: EdgeParameters) -> dict[str, object]:
+    """Settings of the segmentation that the parameters name."""
+    if parameters.segmentation != "onnx":
+        return {}
+    return {
+        "path": parameters.network_path,
+        "input_size": parameters.network_input_size,
+        "mean": parameters.network_mean,
+        "scale": parameters.network_scale,
+    }

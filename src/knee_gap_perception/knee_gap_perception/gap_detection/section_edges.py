@@ -1,0 +1,333 @@
+"""The edges of the opening in the present image, at the section where an instrument would pass.
+
+The tracked points are the same in all images; the edges are not. Each image shows where tissue ends beside
+the points, and the largest circle between those borders, around a centre on the line across the opening, says
+how wide the opening looks: tissue beside that line counts as far as an instrument of that width reaches.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from knee_gap_core.values.arrays import Array, Image, Mask
+from knee_gap_core.values.edges import EdgeState, SectionEdges
+from knee_gap_perception.camera.models import Camera, bearing_jacobian
+from knee_gap_perception.image.field_of_view import FieldOfView
+
+ROW_STEP = 4.0  # [px] along the opening between the lines on which its borders are looked for
+BEYOND = 24  # [px] beyond a tracked point to which its border may lie
+# Share of the way from the gap's brightness to the tissue's at which tissue begins. Light grazes a smooth
+# bone beside its contour, so tissue is dim there: half of the way would place the border inside the tissue.
+TISSUE_BEGINS = 0.25
+# The same shares for where tissue begins at the earliest and at the latest.
+EARLIEST, LATEST = 0.12, 0.5
+LEAST_STEP = 10.0  # [grey levels] from gap to tissue, below which no border can be placed
+SLOWEST_TURN = np.radians(4.0)  # by which the direction across may turn from an image to the next
+TURN_SHARE = 0.3  # of the difference that it turns
+JUMP = 8.0  # [px] that an edge may move against its point from an image to the next
+JUMP_RATE = 60.0  # [px/s] by which that grows while the edge is not seen
+HELD = 0.5  # [s] after which an edge that stays elsewhere is believed
+FLOOR = 1.0  # [px] standard deviation of an edge that is perfectly sharp
+WIDTH_SHARE = 0.3  # of the width of a border, that its place is uncertain by
+BOUND = 3.0  # standard deviations
+MARGIN = 3.0  # [px] from the border of the field of view within which an edge counts as lying at it
+FOREIGN_SHARE = 0.3  # of the lines of an instrument's width that may be covered
+COARSE = 40  # steps in which the centre of the largest circle is looked for, three times finer and finer
+STATIONS = 3  # sections to either side in a profile
+STATION_STEP = 0.6  # of the circle's radius between two of them
+
+
+class Borders(NamedTuple):
+    """Where tissue begins on lines across the opening, to one side: distances (n,) from the centre [px].
+
+    `earliest` and `latest` (n,) enclose `place`. `known` is false for a line whose border is not seen:
+    covered, or beyond where it was looked for; the border then lies at `place` or farther out.
+    """
+
+    place: Array
+    earliest: Array
+    latest: Array
+    known: Mask
+
+
+class Circle(NamedTuple):
+    """The largest circle around a place on a line: offset of its centre along the line and radius [px].
+
+    `contacts` (2,): the lines on which it touches either border.
+    """
+
+    offset: float
+    radius: float
+    contacts: tuple[int, int]
+
+
+def largest_circle(rows: Array, borders: tuple[Array, Array], at: float = 0.0) -> Circle:
+    """The largest circle with its centre on the line at `at`, between borders (n,) on lines at `rows` (n,).
+
+    Borders are distances from the line through the section's centre, to the one side and to the other, both
+    positive outwards; all lengths in pixels.
+    """
+    reach = float(min(borders[0].max(), borders[1].max()))
+    offset = 0.0
+    for half in (reach, 2.0 * reach / COARSE, 4.0 * reach / COARSE**2):
+        offsets = offset + np.linspace(-half, half, COARSE + 1)
+        squares = _squared_distances(rows, borders, at, offsets)
+        room = squares.min(axis=(0, 2))
+        best = int(room.argmax())
+        offset = float(offsets[best])
+    contacts = squares[:, best].argmin(axis=1)
+    return Circle(offset, float(np.sqrt(room[best])), (int(contacts[0]), int(contacts[1])))
+
+
+def _squared_distances(rows: Array, borders: tuple[Array, Array], at: float, offsets: Array) -> Array:
+    """Squared distances (2, m, n) [px^2] of both borders from places (m,) on the line at `at`."""
+    first, second = borders[0] + offsets[:, None], borders[1] - offsets[:, None]
+    return np.asarray(np.maximum(np.stack([first, second]), 0.0) ** 2 + (rows - at) ** 2)
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Brightness (rows, columns) on lines across the opening, and the lines' places along it [px].
+
+    Column `middle` lies on the line along the opening through the section's centre.
+    """
+
+    values: Image
+    rows: Array
+    middle: int
+
+
+class SectionEdgeFinder:
+    """Finds the edges beside two tracked points in one image after the other."""
+
+    def __init__(self, centre: Array, across: Array, points: Array) -> None:
+        """Begin at the section around `centre` (2,) [px], across along a unit vector (2,).
+
+        `points` (2, 2) [px] are the tracked points beside it, in the same image.
+        """
+        self._across = across
+        along = np.array([-across[1], across[0]])
+        middle = points.mean(axis=0)
+        self._shift = float((centre - middle) @ along)
+        self._span = float(np.linalg.norm(points[1] - points[0]))
+        self._offset = float((centre - middle) @ across)
+        self._insets: Array | None = None
+        self._seen_ns = 0
+        self._circle: Circle | None = None
+        self._settled = False
+
+    def find(
+        self,
+        stamp_ns: int,
+        grey: Image,
+        foreign: Mask,
+        scale: float,
+        field: FieldOfView,
+        camera: Camera,
+        points: Array,
+        *,
+        profile: bool = False,
+    ) -> tuple[SectionEdges, tuple[SectionEdges, ...]]:
+        """The edges at the section, and those at more sections along the opening if `profile`.
+
+        `grey` (h, w) is the image exposed at a stamp [ns]; `foreign` the picture, made smaller by `scale`,
+        where it shows instruments or glare; `points` (2, 2) [px] the tracked points in it.
+        """
+        edges: SectionEdges = SectionEdges()
+        more: tuple[SectionEdges, ...] = ()
+        for _ in range(1 if self._settled else 4):
+            centre = self._centre(points)
+            found = self._borders(grey, foreign, scale, centre, points, profile)
+            if found is None:
+                return SectionEdges(), ()
+            rows, borders = found
+            circle = largest_circle(rows, (borders[0].place, borders[1].place))
+            edges = self._edges(circle, rows, borders, centre, field, camera)
+            if not self._settled:
+                self._turn(circle, rows, borders, 1.0)
+        self._settled = True
+        insets = self._insets_of(circle, points, centre)
+        if edges.seen and not self._plausible(stamp_ns, insets):
+            return SectionEdges(), ()
+        if edges.seen:
+            self._insets, self._seen_ns, self._circle = insets, stamp_ns, circle
+            self._turn(circle, rows, borders, TURN_SHARE)
+            if profile:
+                more = self._profile(circle, rows, borders, centre, field, camera)
+        return edges, more
+
+    def _centre(self, points: Array) -> Array:
+        """Where the section's centre is now (2,) [px]: it keeps its place between the points."""
+        along = np.array([-self._across[1], self._across[0]])
+        grown = float(np.linalg.norm(points[1] - points[0])) / max(self._span, 1.0)
+        shift = self._shift * float(np.clip(grown, 0.3, 3.0))
+        centre = points.mean(axis=0) + shift * along + self._offset * self._across
+        if self._circle is not None and self._insets is not None:
+            # Midway between the edges, where they were against their points in the last image.
+            across = (points - centre) @ self._across + np.array([1.0, -1.0]) * self._insets
+            centre = centre + across.mean() * self._across
+        return np.asarray(centre)
+
+    def _borders(
+        self, grey: Image, foreign: Mask, scale: float, centre: Array, points: Array, profile: bool
+    ) -> tuple[Array, tuple[Borders, Borders]] | None:
+        """Lines (n,) along the opening and the borders on either side; None where none can be placed."""
+        reaches = np.abs((points - centre) @ self._across) + BEYOND
+        if not (np.isfinite(reaches).all() and reaches.max() < 2000.0):
+            return None
+        half = float(reaches.max())
+        extent = half * (1.0 + STATIONS * STATION_STEP) if profile else half
+        strip = self._strip(grey, centre, half, extent)
+        gap = self._gap_level(strip, half)
+        along = np.array([-self._across[1], self._across[0]])
+        sides = []
+        for index, sign in enumerate((-1.0, 1.0)):
+            tissue = _tissue_level(grey, points[index])
+            if tissue - gap < LEAST_STEP:
+                return None
+            length = int(reaches[index])
+            columns = strip.middle + (sign * np.arange(length)).astype(int)
+            lines = strip.values[:, columns].astype(np.float64)
+            place, earliest, latest = (
+                _last_below(lines, gap + share * (tissue - gap))
+                for share in (TISSUE_BEGINS, EARLIEST, LATEST)
+            )
+            ends = centre + sign * place[:, None] * self._across + strip.rows[:, None] * along
+            column, row = np.rint((ends + 0.5) * scale - 0.5).astype(int).T
+            covered = foreign[row.clip(0, foreign.shape[0] - 1), column.clip(0, foreign.shape[1] - 1)]
+            known = ~covered & (place < length - 2)
+            sides.append(Borders(place, np.minimum(earliest, place), np.maximum(latest, place), known))
+        return strip.rows, (sides[0], sides[1])
+
+    def _strip(self, grey: Image, centre: Array, half: float, extent: float) -> _Strip:
+        count = int(np.ceil(extent / ROW_STEP))
+        width = int(np.ceil(half)) + 1
+        along = np.array([-self._across[1], self._across[0]])
+        matrix = np.stack([self._across, ROW_STEP * along], axis=1)
+        shift = centre - matrix @ np.array([width, count], float)
+        values = cv2.warpAffine(
+            grey,
+            np.concatenate([matrix, shift[:, None]], axis=1),
+            (2 * width + 1, 2 * count + 1),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        smooth = np.asarray(cv2.blur(values, (3, 3)), np.uint8)
+        return _Strip(smooth, ROW_STEP * np.arange(-count, count + 1.0), width)
+
+    def _gap_level(self, strip: _Strip, half: float) -> float:
+        """Brightness of the opening's middle."""
+        radius = 0.3 * half if self._circle is None else 0.5 * self._circle.radius
+        reach = max(int(radius), 4)
+        rows = np.abs(strip.rows) <= max(radius, ROW_STEP)
+        return float(np.median(strip.values[rows, strip.middle - reach : strip.middle + reach + 1]))
+
+    def _turn(self, circle: Circle, rows: Array, borders: tuple[Borders, Borders], share: float) -> None:
+        """Turn the direction across towards the line between the circle's two contacts."""
+        first, second = circle.contacts
+        apart = np.array(
+            [borders[0].place[first] + borders[1].place[second], rows[second] - rows[first]], float
+        )
+        angle = float(np.arctan2(apart[1], apart[0]))
+        angle = float(np.clip(share * angle, -SLOWEST_TURN / share, SLOWEST_TURN / share))
+        cosine, sine = np.cos(angle), np.sin(angle)
+        along = np.array([-self._across[1], self._across[0]])
+        turned = cosine * self._across + sine * along
+        self._across = turned / np.linalg.norm(turned)
+
+    def _edges(
+        self,
+        circle: Circle,
+        rows: Array,
+        borders: tuple[Borders, Borders],
+        centre: Array,
+        field: FieldOfView,
+        camera: Camera,
+        at: float = 0.0,
+    ) -> SectionEdges:
+        along = np.array([-self._across[1], self._across[0]])
+        place = centre + at * along + circle.offset * self._across
+        pixels = place + np.array([[-1.0], [1.0]]) * circle.radius * self._across
+        within = np.abs(rows - at) <= circle.radius
+        states, deviations = [], []
+        for index in (0, 1):
+            side, contact = borders[index], circle.contacts[index]
+            width = float(side.latest[contact] - side.earliest[contact])
+            deviations.append(float(np.hypot(FLOOR, WIDTH_SHARE * width)))
+            if field.depth_inside(pixels[index]) < MARGIN:
+                states.append(EdgeState.AT_BORDER)
+            elif not side.known[contact] or np.mean(~side.known[within]) > FOREIGN_SHARE:
+                states.append(EdgeState.UNKNOWN)
+            else:
+                states.append(EdgeState.SEEN)
+        bearings = camera.bearings(pixels)
+        steps = [float(np.linalg.norm(bearing_jacobian(camera, pixel) @ self._across)) for pixel in pixels]
+        angles = np.array(deviations) * steps
+        if not (np.isfinite(bearings).all() and np.isfinite(angles).all()) or circle.radius < 2.0:
+            return SectionEdges()
+        missing = np.array([state is EdgeState.UNKNOWN for state in states])
+        bearings[missing], pixels[missing] = np.nan, np.nan
+        return SectionEdges(
+            states=(states[0], states[1]),
+            pixels=pixels,
+            bearings=bearings,
+            deviations=np.where(missing, np.nan, angles),
+            error=float("nan") if missing.any() else float(BOUND * angles.max()),
+        )
+
+    def _insets_of(self, circle: Circle, points: Array, centre: Array) -> Array:
+        """How far (2,) [px] each tracked point lies beyond its edge, across the opening."""
+        places = (points - centre) @ self._across
+        return np.array(
+            [circle.offset - circle.radius - places[0], places[1] - circle.offset - circle.radius]
+        )
+
+    def _plausible(self, stamp_ns: int, insets: Array) -> bool:
+        """Whether the edges are where those of the last image lead one to expect them."""
+        if self._insets is None:
+            return True
+        since = 1e-9 * (stamp_ns - self._seen_ns)
+        return since > HELD or bool(np.abs(insets - self._insets).max() < JUMP + JUMP_RATE * since)
+
+    def _profile(
+        self,
+        circle: Circle,
+        rows: Array,
+        borders: tuple[Borders, Borders],
+        centre: Array,
+        field: FieldOfView,
+        camera: Camera,
+    ) -> tuple[SectionEdges, ...]:
+        sections = []
+        for station in range(-STATIONS, STATIONS + 1):
+            at = station * STATION_STEP * circle.radius
+            there = largest_circle(rows, (borders[0].place, borders[1].place), at)
+            sections.append(self._edges(there, rows, borders, centre, field, camera, at))
+        return tuple(sections)
+
+
+def _tissue_level(grey: Image, pixel: Array) -> float:
+    """Brightness of the tissue around a tracked point."""
+    column, row = np.rint(pixel).astype(int)
+    patch = grey[max(0, row - 8) : max(0, row + 9), max(0, column - 8) : max(0, column + 9)]
+    return float(np.median(patch)) if patch.size else 0.0
+
+
+def _last_below(lines: Array, threshold: float) -> Array:
+    """Distance (n,) [px] along each line (n, m) of the last crossing of a threshold, from dark to bright.
+
+    0 where a line is bright from its start, its length where it ends dark.
+    """
+    dark = lines <= threshold
+    count = lines.shape[1]
+    last = np.where(dark.any(axis=1), count - 1 - dark[:, ::-1].argmax(axis=1), -1)
+    inside = (last >= 0) & (last < count - 1)
+    index = np.clip(last, 0, count - 2)
+    row = np.arange(len(lines))
+    before, after = lines[row, index], lines[row, index + 1]
+    share = np.where(
+        after > before, (threshold - before) / np.where(after > before, after - before, 1.0), 0.0
+    )
+    return np.where(inside, index + share, np.where(last < 0, 0.0, float(count - 1)))

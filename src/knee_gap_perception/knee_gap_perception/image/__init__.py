@@ -1,0 +1,1 @@
+"""The arthroscope's image: field of view, instruments and glare."""

@@ -1,0 +1,1 @@
+"""Selection of points on tissue and their tracking from image to image."""

@@ -1,0 +1,1 @@
+"""Pose of the lens from tracked bodies: validity, label swaps, reference body."""

@@ -1,0 +1,1 @@
+"""Rotation of an oblique scope in its camera head: notch, shaft axis, rotated poses."""

@@ -1,0 +1,1 @@
+"""Precision of a tracker, from a recording of a body."""

@@ -1,0 +1,1 @@
+"""OptiTrack's NatNet protocol: packets, session, clock, client."""

@@ -1,0 +1,1 @@
+"""The command `evaluate`: predicted gap masks against marked or simulated ones."""

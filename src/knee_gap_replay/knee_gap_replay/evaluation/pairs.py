@@ -1,0 +1,161 @@
+"""What `evaluate` compares: pairs of a predicted and a true mask, from folders or from recorded bags.
+
+The truth of a bag is a topic of masks, or the scene of a simulated bag.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from knee_gap_core.user_files import FileError, read_bytes, shown
+from knee_gap_core.values.arrays import Image, Mask
+from knee_gap_perception.calibrate.bag_input import CalibrationBag
+from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
+from knee_gap_simulation.recordings.bag_truth import gap_masks
+
+MaskAt = Callable[[int], Mask | None]
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+SHEET_ROWS = 8
+MOST_PICTURE_BYTES = 256 << 20
+
+
+class Pair(NamedTuple):
+    """A predicted and a marked mask (h, w), the set and name they go by, and the picture if there is one."""
+
+    image_set: str
+    name: str
+    predicted: Mask
+    marked: Mask
+    picture: Image | None
+
+
+class BagTopics(NamedTuple):
+    """Where a bag has its images, predicted masks and true masks."""
+
+    image: str
+    mask: str
+    truth: str
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a recorded bag rather than a folder of pictures."""
+    return path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
+
+
+def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[int, Iterator[Pair]]:
+    """Masks of two folders with the same name but for the suffix; a subfolder is a set of its own.
+
+    Raises PerceptionError for folders that are missing or share no name, and for files that are no images.
+    """
+    predictions, marks = _files(predicted), _files(marked)
+    views = _files(pictures) if pictures else {}
+    names = sorted(predictions.keys() & marks.keys())
+    if not names:
+        raise PerceptionError(f"no mask in {predicted} has the name of one in {marked}")
+    if unpaired := len(predictions.keys() ^ marks.keys()):
+        print(f"evaluate: {unpaired} masks have no partner and are left out", file=sys.stderr)
+
+    def pairs() -> Iterator[Pair]:
+        for name in names:
+            view = _image(views[name]) if name in views else None
+            folder = name.parent.as_posix()
+            label = "all" if folder == "." else folder
+            yield Pair(label, name.name, _mask(predictions[name]), _mask(marks[name]), view)
+
+    return len(names), pairs()
+
+
+def bag_pairs(
+    predicted: Path, truth: Path, topics: BagTopics, segmentation: str | None, every: int
+) -> tuple[int, Iterator[Pair]]:
+    """Masks of one bag against the truth of another, or of itself, by their stamps; every so many-th image.
+
+    Predicted are the masks recorded in the bag; where there are none, or a segmentation is named, its images
+    are segmented here, as segmentation_node does. Raises PerceptionError for topics that are not in the bag
+    and for a bag whose truth nobody knows.
+    """
+    bag, marked = CalibrationBag(predicted), truth_of(truth, topics.truth)
+    recorded = segmentation is None and bag.has(topics.mask)
+    stamps = bag.image_stamps(topics.mask if recorded else topics.image)[::every]
+    wanted = {int(stamp) for stamp in stamps}
+
+    def predictions() -> Iterator[tuple[int, Mask, Image | None]]:
+        if recorded:
+            views = _first_pictures(CalibrationBag(truth), topics.image, wanted)
+            for stamp, image in bag.images(topics.mask):
+                if stamp in wanted:
+                    yield stamp, image[..., 0] > 127, views.get(stamp)
+            return
+        parameters = EdgeParameters()
+        detector = GapEdgeTracker(replace(parameters, segmentation=segmentation or parameters.segmentation))
+        for stamp, image in bag.images(topics.image):
+            if stamp in wanted:
+                yield stamp, detector.gap_mask(image) > 0, image
+
+    def pairs() -> Iterator[Pair]:
+        for stamp, mask, picture in predictions():
+            if (true := marked(stamp)) is not None:
+                yield Pair(predicted.stem, str(stamp), mask, true, picture)
+
+    return len(wanted), pairs()
+
+
+def truth_of(bag: Path, topic: str) -> MaskAt:
+    """True mask at a stamp [ns], None where there is none; raises PerceptionError where nobody knows any."""
+    source = CalibrationBag(bag)
+    if source.has(topic):
+        packed = {s: (np.packbits(image[..., 0] > 127), image.shape[:2]) for s, image in source.images(topic)}
+
+        def recorded(stamp: int) -> Mask | None:
+            if stamp not in packed:
+                return None
+            bits, (height, width) = packed[stamp]
+            return np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
+
+        return recorded
+    if (masks := gap_masks(bag)) is not None:
+        return masks
+    raise PerceptionError(f"{bag} has no truth: no topic {topic}, and it is not simulated")
+
+
+def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[int, Image]:
+    """The pictures that a sheet shows, by stamp; none where the bag has no images."""
+    if not bag.has(topic):
+        return {}
+    return dict(islice(((s, image) for s, image in bag.images(topic) if s in wanted), SHEET_ROWS))
+
+
+def _files(folder: Path) -> dict[Path, Path]:
+    if not folder.is_dir():
+        raise PerceptionError(f"{shown(folder)} is no folder")
+    return {
+        path.relative_to(folder).with_suffix(""): path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() in SUFFIXES
+    }
+
+
+def _image(path: Path) -> Image:
+    try:
+        data = np.frombuffer(read_bytes(path, MOST_PICTURE_BYTES), dtype=np.uint8)
+    except FileError as error:
+        raise PerceptionError(str(error)) from None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if image is None:
+        raise PerceptionError(f"{path} is no image that can be read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _mask(path: Path) -> Mask:
+    """The gap is what is brighter than half; in masks of 0 and 1, what is 1."""
+    image = _image(path).max(axis=2)
+    return np.asarray(image > (0 if image.max() <= 1 else 127))

@@ -1,0 +1,114 @@
+"""Pictures of the knee under given conditions."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_simulation.knee.camera_head import CameraHead, focus_blur, motion_blur
+from knee_gap_simulation.knee.difficulty import Conditions
+from knee_gap_simulation.knee.fluid import Debris, Turbidity
+from knee_gap_simulation.knee.ray_casting import NOTHING, SurfaceMapper
+from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.tissues import knee_textures
+from knee_gap_simulation.scope.imaging import ByteImage, FloatImage
+from knee_gap_simulation.scope.lens import Lens
+from knee_gap_simulation.surfaces.shading import Light, shade
+
+
+class KneeLight(NamedTuple):
+    """What falls on the sensor, in the box around the picture, and what it comes from.
+
+    light (h, w, 3): linear, blue green red. gap_mask (height, width): the pixels of the whole image that
+    look into the gap. debris_cover (height, width): how much of each pixel debris covers.
+    """
+
+    light: FloatImage
+    gap_mask: npt.NDArray[np.bool_]
+    debris_cover: FloatImage
+
+
+class KneeCamera:
+    """Renders pictures of a knee in order of time."""
+
+    def __init__(
+        self, scene: KneeScene, lens: Lens, conditions: Conditions, seed: int, workers: int = 2
+    ) -> None:
+        self._scene, self._lens, self._conditions = scene, lens, conditions
+        stop = lens.field_stop()
+        rows, columns = np.nonzero(stop)
+        self._box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+        self._stop = np.ascontiguousarray(stop[self._box])
+        offset = lens.pixel_grid()[self._box] - (lens.centre_x_px, lens.centre_y_px)
+        radius = np.hypot(offset[..., 0], offset[..., 1]) / lens.radius_px
+        # The soft border of the stop shows what lies at the rim of the field of view.
+        shrink = np.where(self._stop > 0.0, np.minimum(1.0, (1.0 - 1e-9) / np.maximum(radius, 1e-9)), 1.0)
+        centre = np.array([lens.centre_x_px, lens.centre_y_px])
+        self._bearings = lens.bearings(centre + offset * shrink[..., None])
+        self._inside = np.isfinite(self._bearings[..., 0])
+        self._mapper = SurfaceMapper(scene, self._bearings)
+        self._textures = knee_textures(seed, conditions.contrast)
+        self._light = Light(
+            spread=conditions.beam,
+            absorption=conditions.absorption,
+            glare=conditions.glare,
+            shininess=70.0,
+            ambient=0.012,
+            glint=4.0,
+            sheen=0.03,
+            facing_exponent=0.6,
+        )
+        self._turbidity = Turbidity(conditions.veil, conditions.wisps, self._stop.shape, seed)
+        self._debris = Debris(conditions.debris, seed)
+        self._head = CameraHead(conditions, self._stop, radius.astype(np.float32), seed)
+
+    def light(self, T_scene_lens: Array, time: float, shift_px: Array, probe: Array | None) -> KneeLight:
+        """What falls on the sensor from a lens pose at a time [s]; may be called from several threads.
+
+        ``shift_px`` (2,) is how far the middle of the picture moves while the shutter is open.
+        """
+        lamp = T_scene_lens[:3, :3] @ np.asarray(self._light.position) + T_scene_lens[:3, 3]
+        seen = self._mapper.map(T_scene_lens, lamp, probe)
+        inside = self._inside
+        directions = self._bearings[inside] @ T_scene_lens[:3, :3].T
+        points = T_scene_lens[:3, 3] + seen.lengths[inside, None] * directions
+        surfaces = seen.surfaces[inside]
+        light: FloatImage = np.zeros((*self._stop.shape, 3), np.float32)
+        light[inside] = shade(
+            points,
+            seen.normals[inside],
+            self._scene.uv(points, surfaces),
+            surfaces,
+            self._textures,
+            T_scene_lens,
+            self._light,
+            seen.reach[inside],
+        )
+        light = self._turbidity.over(light, seen.lengths, time, T_scene_lens[:3, 3])
+        light = focus_blur(light, seen.lengths, self._conditions.defocus_px)
+        light, cover = self._debris.over(
+            light,
+            T_scene_lens,
+            np.where(seen.surfaces == NOTHING, 1.0, seen.lengths),
+            time,
+            self._lens,
+            (self._box[0].start, self._box[1].start),
+            self._conditions.softness_px,
+        )
+        light = motion_blur(light, shift_px)
+        whole = (self._lens.height_px, self._lens.width_px)
+        mask, debris_cover = np.zeros(whole, bool), np.zeros(whole, np.float32)
+        gap = np.zeros(self._stop.shape, bool)
+        gap[inside] = self._scene.is_gap(points, surfaces)
+        mask[self._box], debris_cover[self._box] = gap & (self._stop >= 1.0), cover
+        return KneeLight(light, mask, debris_cover)
+
+    def develop(self, light: KneeLight, frame: int, step_s: float) -> ByteImage:
+        """The picture (height, width, 3) bgr8 of light; in order of time, as the exposure follows.
+
+        ``frame`` seeds its noise, ``step_s`` is the time since the last picture.
+        """
+        image = np.zeros((self._lens.height_px, self._lens.width_px, 3), np.uint8)
+        image[self._box] = self._head.develop(light.light, frame, step_s)
+        return image

@@ -1,0 +1,323 @@
+"""The bench: a knee as hard to see as asked for, frame by frame, with the whole truth.
+
+    bench = KneeSimulator(level=2, seed=5, travel_direction="along")
+    for frame in bench.frames():              # rendered one by one; the same arguments give the same bytes
+        frame.image, frame.stamp_ns           # (720, 1280, 3) bgr8; nanoseconds
+        frame.T_world_lens_tracked            # what the tracker says, interpolated to the stamp
+        frame.T_world_lens, frame.gap_mask    # the truth
+        if frame.index == 0:
+            points = bench.points(frame, pixels)      # the surface points behind any pixels (n, 2)
+        sightings = bench.follow(points, frame)       # where those same points are now: visibility, pixels,
+        ...
+        bench.instrument_gap(frame, edges)    # what an instrument meets between edges (2, 3) of the frame
+
+Everything may be set one by one: ``KneeSimulator(level=1, difficulty={"debris": 3}, gap=0.004,
+depth=0.010)``; ``gap=None`` gives a closed joint, in which there is no gap to be found. What is not given is
+drawn from the seed: the gap from 3-8 mm, the depth from 8-15 mm. ``bench.lens`` is the lens (an equidistant
+fisheye), ``bench.nearest_distance`` the smallest distance between condyle and meniscus where an instrument
+passes, ``bench.tracked_body_poses()`` the raw poses at 120 Hz.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.knee.difficulty import Conditions, Difficulty, conditions
+from knee_gap_simulation.knee.ground_truth import PointObservations, SurfacePoints, follow, surface_points
+from knee_gap_simulation.knee.knee_camera import KneeCamera, KneeLight
+from knee_gap_simulation.knee.probe import Probe
+from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.recordings.scene_truth import SceneTruth
+from knee_gap_simulation.rigid import from_parts
+from knee_gap_simulation.scope.arthroscope import Scope
+from knee_gap_simulation.scope.clocks import stamp_ns, tracker_times
+from knee_gap_simulation.scope.hand_motion import Hand, HandMotion, TravelDirection
+from knee_gap_simulation.scope.imaging import ByteImage, FloatImage, decoded, jpeg
+from knee_gap_simulation.scope.lens import Lens
+from knee_gap_simulation.scope.media import IN_SALINE, Media, Medium, RefractedLens
+from knee_gap_simulation.scope.tracker import track_lens, world_from_scene
+from knee_gap_simulation.surfaces.instrument_gap import InstrumentGap
+
+# Nearer than this to any surface [m] no scope gets.
+LEAST_CLEARANCE = 0.0006
+
+
+class Draw(Enum):
+    """A value that is drawn from the seed."""
+
+    FROM_SEED = "from the seed"
+
+
+FROM_SEED = Draw.FROM_SEED
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorFrame:
+    """One frame and its truth. Poses are (4, 4), lengths in metres.
+
+    ``gap_mask`` (height, width): the pixels that look into the gap, past condyle, meniscus and probe.
+    ``debris_cover`` (height, width) in [0, 1]: how much of each pixel drifting debris covers. ``probe`` (k,
+    4): the rods of the probe in the scene, empty while it is away.
+    """
+
+    index: int
+    stamp_ns: int
+    jpeg: bytes
+    image: ByteImage
+    T_world_lens: Array
+    T_world_lens_tracked: Array
+    gap_mask: npt.NDArray[np.bool_]
+    debris_cover: FloatImage
+    probe: Array
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """What a bench shows. Lengths [m], times [s]. ``gap`` None: a closed joint."""
+
+    difficulty: Difficulty
+    seed: int
+    travel_direction: TravelDirection
+    gap: float | None
+    depth: float
+    travel: float
+    duration_s: float
+    fps: float
+    media: Media = IN_SALINE
+    portal: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values for JSON; those that were not asked for are left out."""
+        values = asdict(self)
+        if self.media == IN_SALINE:
+            del values["media"]
+        if self.portal is None:
+            del values["portal"]
+        return values
+
+
+class KneeSimulator:
+    """A knee, a hand that moves the scope in it, and the pictures and the truth of it."""
+
+    def __init__(
+        self,
+        level: int = 0,
+        seed: int = 0,
+        travel_direction: str = "along",
+        *,
+        gap: float | Draw | None = FROM_SEED,
+        depth: float | Draw = FROM_SEED,
+        travel: float = 0.008,
+        duration_s: float = 4.0,
+        fps: float = 60.0,
+        difficulty: Mapping[str, int] | None = None,
+        workers: int = 2,
+        medium: Medium = "saline",
+        calibrated_in: Medium | None = None,
+        portal: float | None = None,
+    ) -> None:
+        """Lengths [m]. ``difficulty`` sets single levels by name; the result is the same for any ``workers``.
+
+        The knee is full of ``medium``; ``bench.lens`` is the lens there, ``Lens()`` that in ``calibrated_in``
+        (the same). ``portal``: how far behind the tip the hand turns the scope, as `HandMotion` has it.
+
+        Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
+        that does not fit into the joint.
+        """
+        if seed < 0:
+            raise SimulationError(f"the seed must not be negative, but is {seed}")
+        if travel_direction not in list(TravelDirection):
+            choices = ", ".join(TravelDirection)
+            raise SimulationError(f"the travel direction must be one of {choices}, not '{travel_direction}'")
+        if not 0.05 <= duration_s <= 600.0:
+            raise SimulationError(f"the duration must lie in [0.05, 600] s, not {duration_s:g} s")
+        if not 1.0 <= fps <= 240.0:
+            raise SimulationError(f"fps must lie in [1, 240] frames a second, not {fps:g}")
+        rng = np.random.default_rng([seed, 0x4245])
+        drawn_gap, drawn_depth = float(rng.uniform(0.003, 0.008)), float(rng.uniform(0.008, 0.015))
+        self.settings = SimulatorSettings(
+            difficulty=Difficulty.at(level, difficulty),
+            seed=seed,
+            travel_direction=TravelDirection(travel_direction),
+            gap=drawn_gap if isinstance(gap, Draw) else gap,
+            depth=drawn_depth if isinstance(depth, Draw) else depth,
+            travel=travel,
+            duration_s=duration_s,
+            fps=fps,
+            media=Media(medium if calibrated_in is None else calibrated_in, medium),
+            portal=portal,
+        )
+        self.conditions: Conditions = conditions(self.settings.difficulty)
+        self.scene = KneeScene.random(self.settings.gap, seed, self.conditions.roughness)
+        self.lens, self.scope = RefractedLens.of(Lens(), self.settings.media.ratio), Scope()
+        self.T_world_scene = world_from_scene(seed)
+        self._workers = workers
+        self._motion = self._place_hand(rng)
+        self.probe = self._place_probe(rng)
+        self._body_times = tracker_times(duration_s, fps)
+        self._bodies = track_lens(self._true_lenses(), self.scope.body_to_lens(), seed)
+
+    @property
+    def nearest_distance(self) -> float:
+        """Smallest distance [m] between the condyle and the tissue below it, negative in a closed joint."""
+        return self.scene.nearest_distance()[0]
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return round(self.settings.duration_s * self.settings.fps)
+
+    def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[SimulatorFrame]:
+        """Render the frames of a range, lazily and in order, a few ahead on other threads.
+
+        A frame's geometry, noise and debris do not depend on the range; its exposure does, which follows
+        from frame to frame.
+        """
+        camera = KneeCamera(self.scene, self.lens, self.conditions, self.settings.seed)
+        indices = range(start, self.frame_count if stop is None else min(stop, self.frame_count), step)
+        with ThreadPoolExecutor(self._workers) as pool:
+            ahead: deque[tuple[int, Future[KneeLight]]] = deque()
+            for index in indices:
+                ahead.append((index, pool.submit(self._light, camera, index)))
+                if len(ahead) > self._workers:
+                    yield self._frame(camera, *ahead.popleft(), step)
+            while ahead:
+                yield self._frame(camera, *ahead.popleft(), step)
+
+    def points(self, frame: SimulatorFrame, pixels: npt.ArrayLike) -> SurfacePoints:
+        """The surface points that pixels (n, 2) [px] of a frame show; NaN where they show none."""
+        return surface_points(
+            self.scene, self.lens, self.T_world_scene, frame.T_world_lens, frame.probe, pixels
+        )
+
+    def instrument_gap(self, frame: SimulatorFrame, edge_bearings: npt.ArrayLike) -> InstrumentGap:
+        """The instrument gap between two edges (2, 3) of a frame, unit vectors of the lens, in the world."""
+        return self.truth.instrument_gap(frame.T_world_lens, edge_bearings)
+
+    def edges_at_section(
+        self, frame: SimulatorFrame, pixel: npt.ArrayLike, across_direction: npt.ArrayLike | None = None
+    ) -> Array:
+        """True bearings (2, 3) of the edges of a frame at the section through a pixel, as in `SceneTruth`."""
+        return self.truth.edges_at_section(frame.T_world_lens, pixel, across_direction)
+
+    def follow(
+        self, points: SurfacePoints, frame: SimulatorFrame, *, edges: bool = True
+    ) -> PointObservations:
+        """Where surface points are in a frame, whether they are seen, and the nearest edge of the gap.
+
+        Without ``edges`` it is some hundred times faster.
+        """
+        return follow(
+            self.scene,
+            self.lens,
+            self.T_world_scene,
+            frame.T_world_lens,
+            frame.probe,
+            frame.debris_cover,
+            points,
+            edges=edges,
+        )
+
+    def pose(self, time_s: float) -> Array:
+        """``T_scene_lens`` (4, 4), the true pose of the lens in the scene, at a time [s]."""
+        return self._motion.poses(np.array(time_s))
+
+    @property
+    def truth(self) -> SceneTruth:
+        """The truth of the knee for any true lens pose, its sections and instrument gaps among it."""
+        return SceneTruth(self.scene, self.T_world_scene, self.lens, self.scope, self.probe)
+
+    def tracked_body_poses(self) -> tuple[Array, Array, Array]:
+        """Times (n,) [s] at 120 Hz, reported body poses and true lens poses (n, 4, 4) in the world."""
+        return self._body_times, self._bodies, self._true_lenses()
+
+    def _light(self, camera: KneeCamera, index: int) -> KneeLight:
+        time = index / self.settings.fps
+        T_scene_lens = self._motion.poses(np.array(time))
+        return camera.light(T_scene_lens, time, self._shift(time), self.probe.joints(time))
+
+    def _frame(self, camera: KneeCamera, index: int, light: "Future[KneeLight]", step: int) -> SimulatorFrame:
+        time, seen = index / self.settings.fps, light.result()
+        picture = camera.develop(seen, index, step / self.settings.fps)
+        data = jpeg(picture, self.conditions.jpeg_quality)
+        return SimulatorFrame(
+            index=index,
+            stamp_ns=stamp_ns(time),
+            jpeg=data,
+            image=decoded(data),
+            T_world_lens=self.T_world_scene @ self._motion.poses(np.array(time)),
+            T_world_lens_tracked=self._tracked_lens(time),
+            gap_mask=seen.gap_mask,
+            debris_cover=seen.debris_cover,
+            probe=self.probe.joints(time),
+        )
+
+    def _true_lenses(self) -> Array:
+        return self.T_world_scene @ self._motion.poses(np.maximum(self._body_times, 0.0))
+
+    def _tracked_lens(self, time: float) -> Array:
+        """The lens pose that the tracker's two samples around a time give."""
+        after = int(np.searchsorted(self._body_times, time))
+        before = max(0, after - 1)
+        pair = self._bodies[[before, after]] @ self.scope.body_to_lens()
+        begin, end = self._body_times[[before, after]]
+        share = (time - begin) / (end - begin)
+        turn = Slerp([0.0, 1.0], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
+        return from_parts(turn, (1.0 - share) * pair[0, :3, 3] + share * pair[1, :3, 3])
+
+    def _shift(self, time: float) -> Array:
+        """How far [px] the middle of the picture moves while the shutter is open around a time."""
+        half = 0.5 * self.conditions.shutter_s
+        begin, end = self._motion.poses(np.array([time - half, time + half]))
+        place = begin[:3, 3] + self.settings.depth * begin[:3, 2]
+        pixels = [self.lens.pixels(pose[:3, :3].T @ (place - pose[:3, 3])) for pose in (begin, end)]
+        return np.asarray(pixels[1] - pixels[0])
+
+    def _place_hand(self, rng: np.random.Generator) -> HandMotion:
+        """A hand whose whole travel keeps clear of the tissue, as near as it can to where it was drawn."""
+        settings = self.settings
+        hand = Hand(reach_s=3.3, tremor=self.conditions.tremor)
+        roll, pitch = rng.uniform(-0.35, 0.35), rng.uniform(-0.10, 0.12)
+        side, up = rng.uniform(-1.0e-3, 1.0e-3), rng.uniform(-0.8e-3, 0.8e-3)
+        times = np.linspace(0.0, min(settings.duration_s, 8.0), 41)
+        best, most = None, -np.inf
+        for shift in sorted(np.arange(-5.0e-3, 5.01e-3, 0.5e-3), key=abs):
+            motion = HandMotion(
+                travel=settings.travel,
+                depth=settings.depth,
+                direction=settings.travel_direction,
+                roll=roll,
+                pitch=pitch,
+                offset=(side, up + shift, 0.0),
+                hand=hand,
+                seed=settings.seed,
+                portal=settings.portal,
+                shaft=self.scope.shaft_in_lens(),
+            )
+            clearance = float(self.scene.distance(motion.poses(times)[:, :3, 3]).min())
+            if clearance >= LEAST_CLEARANCE:
+                return motion
+            if clearance > most:
+                best, most = shift, clearance
+        raise SimulationError(
+            f"a travel of {1e3 * settings.travel:g} mm {settings.travel_direction} the gap from a depth of "
+            f"{1e3 * settings.depth:g} mm does not fit: the scope would come within {1e3 * most:.2f} mm "
+            f"of tissue (least {1e3 * LEAST_CLEARANCE:g} mm), shifted by {1e3 * (best or 0.0):g} mm"
+        )
+
+    def _place_probe(self, rng: np.random.Generator) -> Probe:
+        places = []
+        for lower in (bool(rng.integers(2)), bool(rng.integers(2)), True, False):
+            x, y, z = (float(value) for value in self.scene.ridge(rng.uniform(-0.0025, 0.0025))[0])
+            opening = self.settings.gap or 0.0
+            places.append((x, y + 0.0003, z - 0.0012) if lower else (x, y - 0.85 * opening, z - 0.0015))
+        return Probe(self.conditions.probe_visits, tuple(places), float(rng.choice([-1.0, 1.0])))

@@ -1,0 +1,1 @@
+"""A NatNet server of simulated bodies."""

@@ -1,0 +1,1 @@
+"""Simulated bags: samples, metadata, ground truth."""

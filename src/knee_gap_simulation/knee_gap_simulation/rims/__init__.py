@@ -1,0 +1,1 @@
+"""Two surfaces with sharp rims: the simple scene."""

@@ -1,0 +1,1 @@
+"""The simulated arthroscope: lens, notch, image sensor, hand motion, tracker."""

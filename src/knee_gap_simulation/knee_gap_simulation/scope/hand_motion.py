@@ -1,0 +1,147 @@
+"""How a hand moves the scope: smooth travel, physiological tremor, slow drift and small turns."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.rigid import from_parts, transform
+
+
+class TravelDirection(StrEnum):
+    """Where the scope travels, seen from the gap: along it, across it, or towards it."""
+
+    ALONG = "along"
+    ACROSS = "across"
+    FORWARD = "forward"
+
+    @property
+    def axis(self) -> int:
+        """Axis of the scene frame (x along the gap, y across it, z away from the lens)."""
+        return {TravelDirection.ALONG: 0, TravelDirection.ACROSS: 1, TravelDirection.FORWARD: 2}[self]
+
+
+def minimum_jerk(phase: npt.ArrayLike) -> Array:
+    """Position in [0, 1] of a minimum-jerk reach at a phase, clipped to [0, 1] (Flash and Hogan, 1985)."""
+    s = np.clip(np.asarray(phase, dtype=np.float64), 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+@dataclass(frozen=True)
+class Hand:
+    """Size of a hand's movements. Lengths [m] and angles [rad] are RMS lengths of the vectors."""
+
+    still_s: float = 0.3
+    reach_s: float = 2.5
+    rest_s: float = 0.2
+    tremor: float = 0.05e-3
+    tremor_turn: float = np.radians(0.03)
+    drift: float = 0.12e-3
+    drift_turn: float = np.radians(0.5)
+    pivot_turn: float = np.radians(2.5)  # turn of the scope about the portal over the whole travel
+
+
+class HandMotion:
+    """Lens poses over time: ``T_scene_lens`` as a smooth function, exact at any time.
+
+    The lens looks along the scene's z from ``depth`` in front of the gap, its picture turned by ``roll``.
+    After a still start it reaches over ``travel`` and back, again and again. The same seed gives the same
+    motion.
+    """
+
+    def __init__(
+        self,
+        *,
+        travel: float,
+        depth: float,
+        direction: TravelDirection = TravelDirection.ALONG,
+        roll: float = np.radians(9.0),
+        pitch: float = 0.0,
+        offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        hand: Hand | None = None,
+        seed: int = 0,
+        portal: float | None = None,
+        shaft: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    ) -> None:
+        """Lengths [m]. `portal`: how far behind the tip the shaft passes through the skin; it turns about it.
+
+        The `shaft` points to the tip, in the frame of the lens. Without a portal the hand turns the view back
+        to the gap by `Hand.pivot_turn`.
+        """
+        if not 0.0 <= travel <= 0.05:
+            raise SimulationError(f"travel must lie in [0, 0.05] m, not {travel}")
+        if not 0.002 <= depth <= 0.05:
+            raise SimulationError(f"depth must lie in [0.002, 0.05] m, not {depth}")
+        self._travel, self._depth, self._axis = travel, depth, direction.axis
+        if portal is not None and not 0.01 <= portal <= 1.0:
+            raise SimulationError(f"the portal must lie in [0.01, 1] m behind the tip, not {portal}")
+        self._hand = hand or Hand()
+        self._offset = np.asarray(offset, dtype=np.float64)
+        view = transform([pitch, 0.0, 0.0], np.zeros(3)) @ transform([0.0, 0.0, roll], np.zeros(3))
+        self._base_rotation = view[:3, :3]
+        self._arm = None if portal is None else portal * self._base_rotation @ np.asarray(shaft, dtype=float)
+        rng = np.random.default_rng([seed, 0x4841])
+        self._tremor = _Wander(rng, self._hand.tremor, (8.0, 12.0), waves=5)
+        self._tremor_turn = _Wander(rng, self._hand.tremor_turn, (8.0, 12.0), waves=5)
+        self._drift = _Wander(rng, self._hand.drift, (0.05, 0.35), waves=3)
+        self._drift_turn = _Wander(rng, self._hand.drift_turn, (0.05, 0.35), waves=3)
+
+    def travelled(self, time_s: npt.ArrayLike) -> Array:
+        """Share of the travel, in [0, 1], that the reach alone has covered at times [s]."""
+        hand = self._hand
+        stroke = hand.reach_s + hand.rest_s
+        since = np.maximum(np.asarray(time_s, dtype=np.float64) - hand.still_s, 0.0)
+        strokes = np.floor(since / stroke)
+        reach = minimum_jerk((since - strokes * stroke) / hand.reach_s)
+        return np.where(strokes % 2 == 0, reach, 1.0 - reach)
+
+    def poses(self, time_s: npt.ArrayLike) -> Array:
+        """``T_scene_lens`` (..., 4, 4) at times (...) [s]."""
+        time = np.asarray(time_s, dtype=np.float64)
+        reached = self.travelled(time) - (1.0 if self._axis == 2 else 0.5)
+        position = self._tremor(time) + self._drift(time) + self._offset
+        position[..., 2] -= self._depth
+        position[..., self._axis] += self._travel * reached
+        turn = self._tremor_turn(time) + self._drift_turn(time)
+        if self._arm is not None:
+            wobble = transform(turn, np.zeros(3))[..., :3, :3]
+            return from_parts(wobble @ self._about_portal(reached) @ self._base_rotation, position)
+        # A scope pivots about its portal: moving the lens to one side turns the view to the other.
+        if self._axis == 0:
+            turn[..., 1] -= self._hand.pivot_turn * reached
+        elif self._axis == 1:
+            turn[..., 0] += self._hand.pivot_turn * reached
+        rotation = transform(turn, np.zeros(3))[..., :3, :3] @ self._base_rotation
+        return from_parts(rotation, position)
+
+    def _about_portal(self, reached: Array) -> Array:
+        """Rotations (..., 3, 3) of a shaft that passes through the portal, for shares (...) of the travel."""
+        assert self._arm is not None
+        before = self._arm / np.linalg.norm(self._arm)
+        after = self._arm + self._travel * reached[..., None] * np.eye(3)[self._axis]
+        after = after / np.linalg.norm(after, axis=-1, keepdims=True)
+        # The shortest turn from one direction to the other: a hand that does not twist the shaft.
+        across = np.cross(before, after)
+        sine = np.linalg.norm(across, axis=-1, keepdims=True)
+        angle = np.arctan2(sine, (after @ before)[..., None])
+        axis = np.divide(across, sine, out=np.zeros_like(across), where=sine > 0)
+        return np.asarray(transform(axis * angle, np.zeros(3))[..., :3, :3])
+
+
+class _Wander:
+    """A smooth vector process: a few sine waves an axis, zero at time 0."""
+
+    def __init__(
+        self, rng: np.random.Generator, rms: float, band_hz: tuple[float, float], waves: int
+    ) -> None:
+        self._frequency = 2.0 * np.pi * rng.uniform(*band_hz, size=(waves, 3))
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, size=(waves, 3))
+        self._amplitude = rms * np.sqrt(2.0 / (3.0 * waves))
+
+    def __call__(self, time: Array) -> Array:
+        angle = time[..., None, None] * self._frequency + self._phase
+        wave: Array = self._amplitude * (np.sin(angle) - np.sin(self._phase)).sum(axis=-2)
+        return wave

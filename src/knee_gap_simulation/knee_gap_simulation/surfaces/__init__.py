@@ -1,0 +1,1 @@
+"""Surfaces of tissue: distances to them, their shading and textures."""

@@ -1,0 +1,1 @@
+"""Test whether the joint has moved during a track."""

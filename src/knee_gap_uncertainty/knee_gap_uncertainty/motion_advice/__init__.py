@@ -1,0 +1,1 @@
+"""Advice where to move the scope."""

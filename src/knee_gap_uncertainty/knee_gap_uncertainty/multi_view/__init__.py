@@ -1,0 +1,1 @@
+"""Maximum likelihood over all views of a track, and its confidence interval."""

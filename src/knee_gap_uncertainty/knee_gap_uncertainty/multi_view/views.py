@@ -1,0 +1,222 @@
+"""The views of a track: lens positions and bearings in one frame, with their errors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from knee_gap_core.values.arrays import Array
+from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_uncertainty.multi_view.likelihood import complete_frame
+
+LONGEST_UNIT_VECTOR_DEVIATION = 1e-3
+# Beyond this standard deviation [rad] a bearing says nothing and the error model of small angles is void.
+LARGEST_BEARING_DEVIATION = 0.5
+# Relative to the largest variance: what rounding may leave of an element that ought to be zero.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class Views:
+    """N views, validated: values finite, bearings of unit length, covariances symmetric and not negative.
+
+    `lens_positions` (N, 3) [m]; `bearings` (N, 2, 3) unit vectors from the lens to both points; both in the
+    frame of the points. `bearing_covariances` (N, 2, 3, 3) [rad^2] of the image error, null along the
+    bearing; `lens_covariances` (N, 3, 3) [m^2]; `rotation_covariances` (N, 3, 3) [rad^2] of the rotation that
+    brought the bearings into this frame: an error common to the two bearings of a view. `common_share` [-]:
+    share of the bearings' variance that is one and the same offset in all images, in the axes of the image.
+    `lens_rotations` (N, 3, 3) takes lens coordinates (z optical axis, x right, y down) to the frame of the
+    points and so says which way those axes lie; without it the lens is taken to look at the middle of the gap
+    and not to roll. `lens_motions` (N, 6) are its velocity [m/s] and turning [rad/s] in the frame of the
+    points, by which the error of a clock moves it, from two poses `motion_times` (N,) [s] apart; None where
+    they are not known. `camera_errors` (N, 2, 3, k) are displacements of the bearings [rad], one for each
+    error of the camera's own numbers, which all views share; None where there are none.
+    `scope_rotations` (N,) [rad] say how far the scope was turned in its camera head; None where it was not.
+    `times` (N,) [s] are the stamps of the images; None where they are not known.
+
+    Raises BadInputError for the first value that breaks a rule.
+    """
+
+    lens_positions: Array
+    bearings: Array
+    bearing_covariances: Array
+    lens_covariances: Array
+    rotation_covariances: Array
+    common_share: float = 0.5
+    lens_rotations: Array | None = None
+    lens_motions: Array | None = None
+    motion_times: Array | None = None
+    camera_errors: Array | None = None
+    scope_rotations: Array | None = None
+    times: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Bring the arrays into contiguous float64 and check them."""
+        for name in (
+            "lens_positions",
+            "bearings",
+            "bearing_covariances",
+            "lens_covariances",
+            "rotation_covariances",
+        ):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
+        count = len(self.lens_positions) if self.lens_positions.ndim else 0
+        _check_shape("lens_positions", self.lens_positions, (count, 3))
+        _check_shape("bearings", self.bearings, (count, 2, 3))
+        _check_shape("bearing_covariances", self.bearing_covariances, (count, 2, 3, 3))
+        _check_shape("lens_covariances", self.lens_covariances, (count, 3, 3))
+        _check_shape("rotation_covariances", self.rotation_covariances, (count, 3, 3))
+        if not 0.0 <= self.common_share <= 1.0:
+            raise BadInputError(f"common_share must lie in [0, 1], not {self.common_share!r}")
+        if count == 0:
+            return
+        lengths = np.linalg.norm(self.bearings, axis=-1)
+        worst = np.unravel_index(np.argmax(np.abs(lengths - 1.0)), lengths.shape)
+        if abs(lengths[worst] - 1.0) > LONGEST_UNIT_VECTOR_DEVIATION:
+            raise BadInputError(
+                f"bearing {worst[1]} of view {worst[0]} must have length 1, not {lengths[worst]:.6g}"
+            )
+        object.__setattr__(self, "bearings", self.bearings / lengths[..., None])
+        if self.lens_rotations is not None:
+            object.__setattr__(
+                self, "lens_rotations", np.ascontiguousarray(self.lens_rotations, dtype=np.float64)
+            )
+            _check_rotations(self.lens_rotations, count)
+        if self.lens_motions is not None:
+            _check_shape("lens_motions", self.lens_motions, (count, 6))
+        if self.motion_times is not None and not (
+            self.motion_times.shape == (count,) and np.all(self.motion_times > 0.0)
+        ):
+            raise BadInputError(f"motion_times must be {count} times above 0 s, not {self.motion_times}")
+        if self.camera_errors is not None:
+            _check_shape("camera_errors", self.camera_errors, (count, 2, 3, self.camera_errors.shape[-1]))
+        _check_covariance("bearing_covariances", self.bearing_covariances)
+        _check_covariance("lens_covariances", self.lens_covariances)
+        _check_covariance("rotation_covariances", self.rotation_covariances)
+        deviations = np.sqrt(np.trace(self.bearing_covariances, axis1=-2, axis2=-1) / 2.0)
+        if not deviations.min() > 0.0:
+            raise BadInputError("the standard deviation of a bearing must be above 0 rad, and one is 0")
+        if deviations.max() > LARGEST_BEARING_DEVIATION:
+            raise BadInputError(
+                f"the standard deviation of a bearing must be at most {LARGEST_BEARING_DEVIATION} rad, "
+                f"not {deviations.max():.3g}"
+            )
+
+    def joined(self, other: "Views") -> "Views":
+        """These views and then `other`'s, with the common share of these."""
+        rotations = (self.lens_rotations, other.lens_rotations)
+        motions = (self.lens_motions, other.lens_motions)
+        times = (self.motion_times, other.motion_times)
+        turns = (self.scope_rotations, other.scope_rotations)
+        seconds = (self.times, other.times)
+        return Views(
+            lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
+            bearings=np.concatenate([self.bearings, other.bearings]),
+            bearing_covariances=np.concatenate([self.bearing_covariances, other.bearing_covariances]),
+            lens_covariances=np.concatenate([self.lens_covariances, other.lens_covariances]),
+            rotation_covariances=np.concatenate([self.rotation_covariances, other.rotation_covariances]),
+            common_share=self.common_share,
+            lens_rotations=None
+            if rotations[0] is None or rotations[1] is None
+            else np.concatenate([rotations[0], rotations[1]]),
+            lens_motions=None
+            if motions[0] is None or motions[1] is None
+            else np.concatenate([motions[0], motions[1]]),
+            motion_times=None
+            if times[0] is None or times[1] is None
+            else np.concatenate([times[0], times[1]]),
+            camera_errors=all_camera_errors([self, other]),
+            scope_rotations=None
+            if turns[0] is None or turns[1] is None
+            else np.concatenate([turns[0], turns[1]]),
+            times=None
+            if seconds[0] is None or seconds[1] is None
+            else np.concatenate([seconds[0], seconds[1]]),
+        )
+
+    def __len__(self) -> int:
+        """Number of views."""
+        return len(self.lens_positions)
+
+    @property
+    def calibrated_rotations(self) -> Array:
+        """(N, 3, 3): what takes an error of the calibrated lens, in its own axes, to the frame of the points.
+
+        The picture of a scope that is turned in its camera head turns on the sensor, T_body_lens(turn) =
+        S(turn) T_body_lens(0) Rz(-turn): an error e of T_body_lens(0) is the error Rz(turn) e of the lens.
+        """
+        rotations = _steady_rotations(self.bearings) if self.lens_rotations is None else self.lens_rotations
+        if self.scope_rotations is None or not self.scope_rotations.any():
+            return rotations
+        cosine, sine = np.cos(self.scope_rotations), np.sin(self.scope_rotations)
+        by_turn = np.tile(np.eye(3), (len(self), 1, 1))
+        by_turn[:, 0, 0], by_turn[:, 0, 1] = cosine, -sine
+        by_turn[:, 1, 0], by_turn[:, 1, 1] = sine, cosine
+        return np.asarray(rotations @ by_turn)
+
+    @property
+    def lens_axes(self) -> Array:
+        """(N, 3, 3): rows x, y and optical axis z of the lens in the frame of the points."""
+        rotations = _steady_rotations(self.bearings) if self.lens_rotations is None else self.lens_rotations
+        return np.ascontiguousarray(np.swapaxes(rotations, -1, -2))
+
+
+def all_camera_errors(parts: Sequence[Views]) -> Array | None:
+    """The camera's errors of several views, one after the other; None where they are not of the same."""
+    errors = [part.camera_errors for part in parts if part.camera_errors is not None]
+    if len(errors) < len(parts) or len({one.shape[-1] for one in errors}) != 1:
+        return None
+    return np.concatenate(errors)
+
+
+def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise BadInputError(f"{name} must have shape {shape}, not {value.shape}")
+    if not np.all(np.isfinite(value)):
+        where = tuple(int(k) for k in np.argwhere(~np.isfinite(value))[0])
+        raise BadInputError(f"{name} must be finite, and element {where} is {value[where]}")
+
+
+def _steady_rotations(bearings: Array) -> Array:
+    """(N, 3, 3) of a lens that looks along the mean of all bearings and does not turn."""
+    mean = bearings.mean(axis=(0, 1))
+    length = float(np.linalg.norm(mean))
+    frame = np.zeros((3, 3))
+    frame[0] = mean / length if length > ROUNDING else bearings[0, 0]
+    complete_frame(frame)
+    return np.tile(np.column_stack([frame[1], frame[2], frame[0]]), (len(bearings), 1, 1))
+
+
+def _check_rotations(rotations: Array, count: int) -> None:
+    _check_shape("lens_rotations", rotations, (count, 3, 3))
+    if np.max(np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3))) > LONGEST_UNIT_VECTOR_DEVIATION:
+        raise BadInputError(
+            "lens_rotations must be rotation matrices, and the rows of one are not orthonormal"
+        )
+
+
+def _check_covariance(name: str, value: Array) -> None:
+    scale = max(float(np.max(np.abs(value))), 1e-300)
+    unit = value / scale
+    if np.max(np.abs(unit - np.swapaxes(unit, -1, -2))) > ROUNDING:
+        raise BadInputError(f"{name} must be symmetric")
+    xx, yy, zz = unit[..., 0, 0], unit[..., 1, 1], unit[..., 2, 2]
+    xy, xz, yz = unit[..., 0, 1], unit[..., 0, 2], unit[..., 1, 2]
+    minors = (
+        *(xx, yy, zz, xx * yy - xy**2, xx * zz - xz**2, yy * zz - yz**2),
+        xx * (yy * zz - yz**2) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz),
+    )
+    if min(float(minor.min()) for minor in minors) < -ROUNDING:
+        raise BadInputError(f"{name} must be positive semi-definite: a variance below 0 was found")
+
+
+def bearing_covariances(bearings: Array, deviation: float | Array) -> Array:
+    """(..., 3, 3) covariances [rad^2] of unit vectors (..., 3), `deviation` [rad] in both image axes."""
+    outer = bearings[..., :, None] * bearings[..., None, :]
+    variance = np.asarray(deviation, dtype=np.float64)[..., None, None] ** 2
+    return np.asarray(variance * (np.eye(3) - outer))
+
+
+def isotropic_covariances(count: int, rms: float) -> Array:
+    """(count, 3, 3) covariances of a vector whose error has the root-mean-square length `rms`."""
+    return np.tile(np.eye(3) * (rms * rms / 3.0), (count, 1, 1))

@@ -1,0 +1,1 @@
+"""Vectors and small matrices for compiled kernels."""

@@ -1,0 +1,1 @@
+"""Errors of the scope's calibration in the estimate."""

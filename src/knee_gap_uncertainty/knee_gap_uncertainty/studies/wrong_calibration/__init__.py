@@ -1,0 +1,1 @@
+"""Study of wrong calibrations of the scope."""

@@ -1,0 +1,1 @@
+"""The paper's method: gap and its range from two views."""
