@@ -18,6 +18,8 @@ def _line(check: TopicCheck, width: int) -> str:
 
 def _run(arguments: argparse.Namespace) -> int:
     with BagReader(arguments.bag) as reader:
+        if reader.renamed:
+            print(reader.renamed)
         checks = check_topics(reader)
         width = max((len(name) for name in checks), default=0)
         for check in checks.values():

@@ -128,6 +128,8 @@ def _play(node: PlayNode, reader: BagReader, arguments: argparse.Namespace, stop
 
 def _run(arguments: argparse.Namespace) -> int:
     with BagReader(arguments.bag) as reader:
+        if reader.renamed:
+            print(f"play: {reader.renamed}", flush=True)
         chosen = frozenset(arguments.topics or reader.topics)
         reader.messages([*chosen, *arguments.wait_for])  # refuses a topic that the bag does not have
         stop = stop_on_signals()

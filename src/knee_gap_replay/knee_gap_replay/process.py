@@ -33,6 +33,8 @@ def _parameters(arguments: argparse.Namespace) -> ParametersFile:
 
 def _run(arguments: argparse.Namespace) -> int:
     with BagReader(arguments.bag) as reader:
+        if reader.renamed:
+            print(f"process: {reader.renamed}", flush=True)
         parameters = _parameters(arguments)
         topics = topics_from(arguments, reader.topics)
         pipeline = GapPipeline.from_parameters(

@@ -20,6 +20,7 @@ from rosbags.typesys.store import Typestore
 from knee_gap_core.bag import qos as qos_profiles
 from knee_gap_core.bag.bag_paths import missing_bag
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.former_names import topic_today, type_today
 from knee_gap_core.bag.mcap_file import McapFile, in_time_order, mcap_files
 from knee_gap_core.bag.mcap_storage import METADATA_RECORD, ChecksummedMcap
 from knee_gap_core.bag.message_types import full_name, known_type, typestore
@@ -150,8 +151,9 @@ class BagReader:
     """Reads a bag folder or a bare `.mcap`, whole, cut or damaged; a context manager.
 
     `topics` maps names to types, `details` to types, quality of service and definitions, `metadata` is the
-    bag's own (custom data). What is damaged is left out and named, one line each, in the log and in `losses`.
-    Raises BagError where there is no bag, or not one that can be read.
+    bag's own (custom data). Topics and types recorded under former names appear under those of today, and
+    `renamed` says so in one line. What is damaged is left out and named, one line each, in the log and in
+    `losses`. Raises BagError where there is no bag, or not one that can be read.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -161,6 +163,8 @@ class BagReader:
         self._has_header: dict[str, bool] = {}
         self._files: list[McapFile] = []
         self._missing: list[str] = []
+        # Names as recorded, by names of today.
+        self._recorded: dict[str, str] = {}
         try:
             for file in self._locate():
                 self._files.append(McapFile(file))
@@ -188,7 +192,14 @@ class BagReader:
         if any(count is None for count in counts):
             return None
         wanted = self.topics if topics is None else topics
-        return sum(count[topic] for count in counts if count is not None for topic in wanted)
+        recorded = [self._recorded.get(topic, topic) for topic in wanted]
+        return sum(count[topic] for count in counts if count is not None for topic in recorded)
+
+    @property
+    def renamed(self) -> str:
+        """One line with the former names that are read under those of today; empty if there are none."""
+        pairs = [f"{former} is {today}" for today, former in self._recorded.items() if former != today]
+        return f"{self.path} was recorded under former names: {', '.join(pairs)}" if pairs else ""
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -235,8 +246,11 @@ class BagReader:
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def _messages(self, topics: frozenset[str] | None) -> Iterator[BagMessage]:
-        for entry in in_time_order(self._files, topics):
-            yield BagMessage(entry.topic, full_name(entry.schema_name), entry.time_ns, entry.data)
+        today = {recorded: name for name, recorded in self._recorded.items()}
+        recorded_topics = None if topics is None else frozenset(self._recorded[name] for name in topics)
+        for entry in in_time_order(self._files, recorded_topics):
+            msgtype = type_today(full_name(entry.schema_name))
+            yield BagMessage(today.get(entry.topic, entry.topic), msgtype, entry.time_ns, entry.data)
 
     def _locate(self) -> list[Path]:
         if not self.path.is_dir():
@@ -281,18 +295,22 @@ class BagReader:
 
     def _read_details(self) -> dict[str, Topic]:
         details: dict[str, Topic] = {}
+        names = {channel.topic for file in self._files for channel in file.channels.values()}
         for file in self._files:
             for channel in file.channels.values():
                 schema = file.schemas.get(channel.schema_id)
                 offered = qos_profiles.parse(channel.metadata.get("offered_qos_profiles", ""))
-                known = details.get(channel.topic) or Topic(
-                    msgtype=full_name(schema.name) if schema else "",
+                # A bag that has both was recorded in a time of change: each stays what it is.
+                name = channel.topic if topic_today(channel.topic) in names else topic_today(channel.topic)
+                self._recorded[name] = channel.topic
+                known = details.get(name) or Topic(
+                    msgtype=type_today(full_name(schema.name)) if schema else "",
                     qos=(),
                     encoding=channel.message_encoding,
                     definition=schema.data.decode(errors="replace") if schema else "",
                     type_hash=channel.metadata.get("topic_type_hash", ""),
                 )
-                details[channel.topic] = known._replace(qos=tuple(dict.fromkeys((*known.qos, *offered))))
+                details[name] = known._replace(qos=tuple(dict.fromkeys((*known.qos, *offered))))
         return details
 
     def _store(self, msgtype: str, definition: str) -> Typestore:

@@ -15,6 +15,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from knee_gap_core.bag import former_names
 from knee_gap_core.bag.errors import BagError
 
 _SOURCE_TREE = Path(__file__).resolve().parents[3]
@@ -153,11 +154,30 @@ def message_class(msgtype: str) -> type:
 
 
 def check_type_hash(msgtype: str, type_hash: str) -> None:
-    """Raise BagError where `type_hash` is told and is not that of the definition installed here.
+    """Raise BagError if `type_hash` is known and is not that of the definition installed here.
 
-    Bytes of another version of a type would be read as wrong numbers.
+    Bytes of another version of a type would be read as wrong numbers. A version in which only names differ is
+    accepted.
     """
-    if type_hash and type_hash != (here := typestore().hash_rihs01(known_type(msgtype))):
+    if not type_hash:
+        return
+    here = typestore().hash_rihs01(known_type(msgtype))
+    if type_hash not in (here, _former_hash(full_name(msgtype))):
         raise BagError(
             f"its {msgtype} is of another version than the one installed ({type_hash}, not {here})"
         )
+
+
+@cache
+def _former_hash(msgtype: str) -> str:
+    """Hash of today's definition under its former names; empty unless something was renamed."""
+    if msgtype not in (*former_names.TYPES.values(), *former_names.FIELDS):
+        return ""
+    text = _definition_file(msgtype).read_text(encoding="utf-8")
+    before = former_names.former_definition(msgtype, text)
+    if before is None:
+        return ""
+    name, definition = before
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(definition, name))
+    return str(store.hash_rihs01(name))

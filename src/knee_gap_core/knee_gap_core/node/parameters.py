@@ -15,6 +15,7 @@ from typing import Any, TypeVar, get_origin, get_type_hints
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
+from knee_gap_core.bag.former_names import renamed_parameters
 from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.user_files import MOST_YAML_BYTES, read_bytes
 
@@ -92,7 +93,9 @@ def refuse_unknown(node: Any, overrides: Iterable[str]) -> None:
     )
     if unknown:
         known = sorted(name for name in node._parameters if not _is_always_allowed(name))
-        raise ConfigurationError(f"no parameter {', '.join(unknown)}; there are: {', '.join(known)}")
+        raise ConfigurationError(
+            f"no parameter {', '.join(unknown)}{renamed_parameters(unknown)}; there are: {', '.join(known)}"
+        )
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, get_origin, get_type_hints
 
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.former_names import renamed_parameters
 from knee_gap_core.user_files import FileError, read_yaml
 
 _PARAMETERS = "ros__parameters"
@@ -52,7 +53,8 @@ class ParametersFile:
         known = {field.name for kind in kinds for field in fields(kind)}
         if unknown := sorted(own.keys() - known - _NOT_OF_CORES):
             choices = ", ".join(sorted(known))
-            raise BagError(f"{self._path}: no parameter {', '.join(unknown)} of {node}; there are: {choices}")
+            words = f"{', '.join(unknown)}{renamed_parameters(unknown)}"
+            raise BagError(f"{self._path}: no parameter {words} of {node}; there are: {choices}")
         try:
             return [_instance(kind, given) for kind in kinds]
         except (ValueError, TypeError) as error:
@@ -63,7 +65,8 @@ class ParametersFile:
         known = {field.name for kinds in nodes.values() for kind in kinds for field in fields(kind)}
         given = _merged(values for name, values in self._by_node if name in _EVERY_NODE)
         if unknown := sorted(given.keys() - known - _NOT_OF_CORES):
-            raise BagError(f"{self._path}: no node has a parameter {', '.join(unknown)}")
+            words = f"{', '.join(unknown)}{renamed_parameters(unknown)}"
+            raise BagError(f"{self._path}: no node has a parameter {words}")
 
 
 def _nodes(tree: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
