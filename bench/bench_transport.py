@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knee_gap_bringup.processes import Processes, StartError, executable
+from knee_gap_bringup.launching.processes import Processes, StartError, executable
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_perception.calibrate.measurements.boards import BoardView
 from knee_gap_perception.calibrate.solvers import hand_eye, intrinsics
 from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, calibrate_hand_eye
@@ -26,7 +27,6 @@ from knee_gap_perception.calibrate.solvers.intrinsics import fit_intrinsics
 from knee_gap_perception.calibrate.solvers.lens_error import lens_errors
 from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 Views = list[TrackedView]

@@ -4,7 +4,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from knee_gap_bringup.processes import executable
+from knee_gap_bringup.launching.processes import executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_perception.calibrate.command import main as calibrate
 from knee_gap_simulation.calibration.bag import CalibrationRecording, make_calibration_bag

@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Float64, Header
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges, GapEstimate, ScopeCalibration, ScopeRotation
 from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy")
 
 from live import Client
 
-from knee_gap_bringup.processes import executable
+from knee_gap_bringup.launching.processes import executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 
 ROOT = Path(__file__).parents[2]

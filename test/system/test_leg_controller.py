@@ -15,7 +15,7 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_msgs.msg import GapEstimate
 
 DOMAIN = 54

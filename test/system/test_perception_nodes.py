@@ -17,7 +17,7 @@ from live import Client
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE

@@ -17,7 +17,7 @@ from live import Client
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 

@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 
 from knee_gap_bringup.comparison import Comparison, compare
-from knee_gap_bringup.processes import executable
+from knee_gap_bringup.launching.processes import executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_uncertainty.messages import stamp_ns
 

@@ -13,7 +13,7 @@ from live import Client
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from knee_gap_bringup.processes import Processes
+from knee_gap_bringup.launching.processes import Processes
 
 DOMAIN = 131
 NODE = """

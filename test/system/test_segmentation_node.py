@@ -16,7 +16,7 @@ from live import Client
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_msgs.srv import ChoosePoint

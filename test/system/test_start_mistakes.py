@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from knee_gap_bringup.processes import executable
+from knee_gap_bringup.launching.processes import executable
 
 pytestmark = pytest.mark.system
 ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": "146", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

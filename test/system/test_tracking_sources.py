@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from live import Client
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 
 DOMAIN = 53
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

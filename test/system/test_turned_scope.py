@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from live import Client
 
 from knee_gap_bringup.comparison import compare
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_msgs.msg import GapEstimate, ScopeNotch
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_simulation.make_bag import Recording, make_bag

@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
-from knee_gap_bringup.processes import Processes, executable
+from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from knee_gap_bringup.comparison import EDGES, GAP, compare
 from knee_gap_bringup.gap_plot import write_gap_plot
-from knee_gap_bringup.launch_plan import DRAIN, NODES
-from knee_gap_bringup.processes import Processes, StartError, executable
+from knee_gap_bringup.launching.plan import DRAIN, NODES
+from knee_gap_bringup.launching.processes import Processes, StartError, executable
 from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError

@@ -4,5 +4,5 @@ from knee_gap_core.node.entry import entry
 
 demo = entry("knee_gap_bringup.demo")
 leg_controller_node = entry("knee_gap_bringup.leg_controller_node", node=True)
-live = entry("knee_gap_bringup.live_command")
-replay = entry("knee_gap_bringup.replay_command")
+live = entry("knee_gap_bringup.launching.live_command")
+replay = entry("knee_gap_bringup.launching.replay_command")

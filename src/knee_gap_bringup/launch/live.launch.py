@@ -13,8 +13,8 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, Opaq
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
-from knee_gap_bringup.launch_actions import actions, refuse
-from knee_gap_bringup.launch_plan import RESPAWN_DELAY, live_plan, live_problem
+from knee_gap_bringup.launching.actions import actions, refuse
+from knee_gap_bringup.launching.plan import RESPAWN_DELAY, live_plan, live_problem
 
 SHARE = Path(get_package_share_directory("knee_gap_bringup"))
 CONFIG = SHARE / "config"

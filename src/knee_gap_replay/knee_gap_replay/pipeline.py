@@ -43,9 +43,9 @@ from knee_gap_perception.trackers.scope_feed import SCOPE, SourceParameters
 from knee_gap_replay.processing import Output
 from knee_gap_replay.topics import InputTopics
 from knee_gap_uncertainty import messages
-from knee_gap_uncertainty.delays import NANOSECONDS
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.inputs.delays import NANOSECONDS
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 
 _LOG = logging.getLogger(__name__)

@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.errors import (
+from knee_gap_core.values.errors import (
     BaselineTooShortError,
     CheiralityError,
     EpipoleError,
     MeasurementError,
     UnderconstrainedError,
 )
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal

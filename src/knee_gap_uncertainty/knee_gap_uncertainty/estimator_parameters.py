@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from knee_gap_core.node.parameter_rules import broken_rule
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_core.values.errors import MeasurementError
 
 # Of a scope that is known exactly, as a simulated one is: nothing of it is uncalibrated.
 EXACT_SCOPE: dict[str, Any] = dict.fromkeys(

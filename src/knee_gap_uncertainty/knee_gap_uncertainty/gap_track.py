@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import norm
 
+from knee_gap_core.values.errors import BaselineTooShortError, MeasurementError
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_uncertainty.acceptance import Facts, Kept, judge
-from knee_gap_uncertainty.errors import BaselineTooShortError, MeasurementError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_profile import GapProfile, gap_profile
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose
-from knee_gap_uncertainty.instrument_gap import (
+from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile, gap_profile
+from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     Edges,
     Opening,
     admitted_ranges,
@@ -23,17 +23,17 @@ from knee_gap_uncertainty.instrument_gap import (
     instrument_gap,
     opening_of,
 )
+from knee_gap_uncertainty.instrument_gap.section_edges import SectionInView
 from knee_gap_uncertainty.joint_motion.joint_motion import Finding, JointMotionTest
 from knee_gap_uncertainty.motion_advice.motion_advice import Situation
 from knee_gap_uncertainty.multi_view.confidence_interval import ConfidenceInterval, confidence_interval
 from knee_gap_uncertainty.multi_view.keyframe_window import ViewWindow
 from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, fit
-from knee_gap_uncertainty.multi_view.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.multi_view.scale_drift import with_scale_drift
 from knee_gap_uncertainty.multi_view.views import Views
 from knee_gap_uncertainty.scope_calibration.calibration_fit import explained_by
+from knee_gap_uncertainty.scope_calibration.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError
-from knee_gap_uncertainty.section_edges import SectionInView
 from knee_gap_uncertainty.two_view.angle_sets import INTERVAL_SIGNS, SIGNS
 from knee_gap_uncertainty.two_view.gap_range import GapRange, gap_range
 from knee_gap_uncertainty.two_view.translation_volume import displacements

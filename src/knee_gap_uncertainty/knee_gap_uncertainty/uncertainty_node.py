@@ -15,9 +15,9 @@ from knee_gap_core.values import gap_estimate
 from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeRotation
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.acceptance import Reason
-from knee_gap_uncertainty.delays import ContinuedClock
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.inputs.delays import ContinuedClock
 from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 from knee_gap_uncertainty.warm_up import warm_up

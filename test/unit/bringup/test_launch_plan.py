@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from knee_gap_bringup import simulated_calibration
-from knee_gap_bringup.launch_plan import (
+from knee_gap_bringup.launching.plan import (
     CALIBRATION_FILE,
     NODES,
     Next,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_perception.calibrate.measurements.boards import BoardView
 from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, calibrate_hand_eye
 from knee_gap_perception.calibrate.solvers.hand_eye_bundle import TrackedView
@@ -14,7 +15,6 @@ from knee_gap_perception.calibrate.solvers.intrinsics import fit_intrinsics
 from knee_gap_perception.calibrate.solvers.lens_error import lens_errors
 from knee_gap_perception.calibrate.solvers.pivot import calibrate_pivot
 from knee_gap_perception.camera.projection import LensModel
-from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "images" / "tracked_laparoscope"

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import minimize
 
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval
 from knee_gap_uncertainty.multi_view.curvature_correction import accepted_above, stray_probability
 from knee_gap_uncertainty.multi_view.ellipsoid_distance import largest_distance, smallest_distance

@@ -6,8 +6,8 @@ import numpy as np
 from travelling_scope import TINY, travelling
 
 from knee_gap_core.values.gap_estimate import GapStatus
-from knee_gap_uncertainty.delays import ContinuedClock, DelayFloor
 from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.inputs.delays import ContinuedClock, DelayFloor
 
 MS = 1_000_000
 SECOND = 1_000_000_000

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
-from knee_gap_uncertainty.errors import MeasurementError
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal

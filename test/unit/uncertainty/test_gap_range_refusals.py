@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.errors import (
+from knee_gap_core.values.errors import (
     BadInputError,
     BaselineTooShortError,
     CheiralityError,

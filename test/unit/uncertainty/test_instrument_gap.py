@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.instrument_gap import (
+from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     CONE,
     KIND_CONTOUR,
     KIND_RIM,

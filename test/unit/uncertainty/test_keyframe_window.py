@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.keyframe_window import ViewWindow
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
 from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdvicePace
 from knee_gap_uncertainty.motion_advice.motion_advice import (
     AdviceParameters,

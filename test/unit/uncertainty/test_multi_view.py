@@ -7,7 +7,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from knee_gap_uncertainty.errors import BadInputError, BaselineTooShortError
+from knee_gap_core.values.errors import BadInputError, BaselineTooShortError
 from knee_gap_uncertainty.multi_view.confidence_interval import confidence_interval
 from knee_gap_uncertainty.multi_view.likelihood import Measured, blank, linearise, mean_frames
 from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, fit, points_jacobian, points_of

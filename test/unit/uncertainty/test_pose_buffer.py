@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer, PoseRefusal
 
 PERIOD_NS = 8_333_333

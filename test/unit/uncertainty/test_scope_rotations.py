@@ -14,8 +14,8 @@ from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal, ScopeRotation, ScopeRotations
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
-from knee_gap_uncertainty.multi_view.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.scope_calibration.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
-from knee_gap_uncertainty.gap_profile import gap_profile
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose
-from knee_gap_uncertainty.instrument_gap import Edges, opening_of
-from knee_gap_uncertainty.multi_view.posed_view import PosedView, posed_view
-from knee_gap_uncertainty.section_edges import NOT_FINITE, NOT_YET, UNSEEN, SectionInView
+from knee_gap_uncertainty.instrument_gap.gap_profile import gap_profile
+from knee_gap_uncertainty.instrument_gap.instrument_gap import Edges, opening_of
+from knee_gap_uncertainty.instrument_gap.section_edges import NOT_FINITE, NOT_YET, UNSEEN, SectionInView
+from knee_gap_uncertainty.scope_calibration.posed_view import PosedView, posed_view
 
 POINTS = np.array([[0.0, -0.003, 0.012], [0.0, 0.003, 0.012]])
 EDGES = np.array([[0.0, -0.002, 0.0125], [0.0, 0.002, 0.0125]])

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_core.values.pose_continuity import PoseContinuity
-from knee_gap_uncertainty.errors import BadInputError
 
 # Over which the velocity is taken [ns]. The tracker's noise on it falls with this time, but the older it is,
 # the more a hand's has changed: 0.0367 mm over 17 ms are 3 mm/s, as are 0.5 m/s^2 in 6 ms.

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from scipy.stats import norm
 
 from knee_gap_core.node.parameter_rules import broken_rule
-from knee_gap_uncertainty.errors import BadInputError, MeasurementError
-from knee_gap_uncertainty.instrument_gap import (
+from knee_gap_core.values.errors import BadInputError, MeasurementError
+from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     Edges,
     edge_points,
     instrument_gap,

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.common_offset import Bend, gap_of
 from knee_gap_uncertainty.multi_view.curvature_correction import radius_at
 from knee_gap_uncertainty.multi_view.ellipsoid_distance import largest_distance, smallest_distance

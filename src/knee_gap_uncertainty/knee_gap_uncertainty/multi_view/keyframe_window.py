@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.views import Views, all_camera_errors
 
 CAPACITY = 240

@@ -11,7 +11,7 @@ import numpy as np
 
 from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array, Mask
-from knee_gap_uncertainty.errors import BadInputError, BaselineTooShortError
+from knee_gap_core.values.errors import BadInputError, BaselineTooShortError
 from knee_gap_uncertainty.multi_view.common_offset import STRAIGHT, Bend, bend_of_gap, is_large
 from knee_gap_uncertainty.multi_view.likelihood import (
     FLAT_PRIOR,

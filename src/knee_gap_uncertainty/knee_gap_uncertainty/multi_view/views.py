@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.errors import BadInputError
+from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.likelihood import complete_frame
 
 LONGEST_UNIT_VECTOR_DEVIATION = 1e-3

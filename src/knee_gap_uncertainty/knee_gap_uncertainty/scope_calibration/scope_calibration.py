@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.errors import UnderconstrainedError
+from knee_gap_core.values.errors import UnderconstrainedError
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
-from knee_gap_uncertainty.multi_view.posed_view import PosedView
 from knee_gap_uncertainty.multi_view.scale_drift import widened
 from knee_gap_uncertainty.multi_view.views import Views
+from knee_gap_uncertainty.scope_calibration.posed_view import PosedView
 
 HASH_DIGITS = 12  # of a hash, in words
 

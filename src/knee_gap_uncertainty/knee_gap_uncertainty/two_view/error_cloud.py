@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.compiled import compiled
-from knee_gap_uncertainty.errors import BadInputError, EpipoleError
+from knee_gap_core.values.errors import BadInputError, EpipoleError
 from knee_gap_uncertainty.numerics.vectors import Vector, add, cross, norm, row, scale, unit, vector
 from knee_gap_uncertainty.two_view.angle_sets import SIGNS, Signs, perturbed_angles
 from knee_gap_uncertainty.two_view.slices import places_by_inverse

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.compiled import compiled
-from knee_gap_uncertainty.errors import BadInputError, BaselineTooShortError
+from knee_gap_core.values.errors import BadInputError, BaselineTooShortError
 from knee_gap_uncertainty.numerics.vectors import norm, row, subtract, vector
 from knee_gap_uncertainty.two_view.angle_sets import INTERVAL_SIGNS, SIGNS, Interval
 from knee_gap_uncertainty.two_view.cone_volume import ConeVolume, volume_distance

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.compiled import compiled
-from knee_gap_uncertainty.errors import CheiralityError, EpipoleError, UnderconstrainedError
+from knee_gap_core.values.errors import CheiralityError, EpipoleError, UnderconstrainedError
 from knee_gap_uncertainty.numerics.vectors import Vector, angle, cross, dot, norm, row, scale, vector
 from knee_gap_uncertainty.two_view.two_views import TwoViews
 

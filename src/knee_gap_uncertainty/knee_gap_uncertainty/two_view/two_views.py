@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.errors import BadInputError, BaselineTooShortError
+from knee_gap_core.values.errors import BadInputError, BaselineTooShortError
 
 # Bearings come through float32 messages and camera models: this is rounding, not a wrong vector.
 UNIT_TOLERANCE = 1e-6

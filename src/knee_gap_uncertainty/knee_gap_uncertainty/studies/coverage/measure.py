@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_uncertainty.studies.coverage.bound import bound
 from knee_gap_uncertainty.studies.coverage.cells import Cell, cells
 from knee_gap_uncertainty.studies.coverage.intervals import intervals

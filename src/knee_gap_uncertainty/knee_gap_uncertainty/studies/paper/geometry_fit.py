@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_uncertainty.studies.paper.geometry import Fit, GapPlace, exact_views
 from knee_gap_uncertainty.studies.paper.scenarios import SCENARIOS, TABLE_4
 from knee_gap_uncertainty.two_view.error_cloud import Apex

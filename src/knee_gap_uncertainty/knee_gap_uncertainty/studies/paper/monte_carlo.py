@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_uncertainty.studies.paper.geometry import Fit, exact_views
 from knee_gap_uncertainty.studies.paper.scenarios import Scenario
 from knee_gap_uncertainty.two_view.gap_range import GapRange, gap_range

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 
-from knee_gap_uncertainty.errors import MeasurementError
+from knee_gap_core.values.errors import MeasurementError
 from knee_gap_uncertainty.numerics.vectors import row, vector
 from knee_gap_uncertainty.studies.paper.figures.drawing import (
     ACCENT,

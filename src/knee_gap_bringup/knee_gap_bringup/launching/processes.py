@@ -11,7 +11,7 @@ from typing import Self
 
 from ament_index_python.packages import get_package_prefix
 
-from knee_gap_bringup.launch_plan import exit_code_of
+from knee_gap_bringup.launching.plan import exit_code_of
 
 # What every node logs once it can take messages.
 READY = "ready"

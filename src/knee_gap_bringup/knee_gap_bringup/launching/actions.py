@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 
-from knee_gap_bringup.launch_plan import DRAIN, RESPAWN_DELAY, Next, PlannedProcess, Role, reaction
+from knee_gap_bringup.launching.plan import DRAIN, RESPAWN_DELAY, Next, PlannedProcess, Role, reaction
 
 # A signal that reaches a node before it can handle one waits, until its entry point lets it through.
 SIGNALS_WAIT = ("env", "--block-signal=INT", "--block-signal=TERM")

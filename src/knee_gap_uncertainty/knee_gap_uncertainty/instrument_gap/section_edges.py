@@ -4,8 +4,8 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
-from knee_gap_uncertainty.instrument_gap import Edges, opening_of
-from knee_gap_uncertainty.multi_view.posed_view import PosedView
+from knee_gap_uncertainty.instrument_gap.instrument_gap import Edges, opening_of
+from knee_gap_uncertainty.scope_calibration.posed_view import PosedView
 
 NOT_YET = "no image of the track has shown the edges of the opening"
 UNSEEN = "the edges of the opening were not seen for too long"

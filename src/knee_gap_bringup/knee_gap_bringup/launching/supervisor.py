@@ -5,7 +5,7 @@ import subprocess
 import time
 from collections.abc import Callable, Sequence
 
-from knee_gap_bringup.launch_plan import (
+from knee_gap_bringup.launching.plan import (
     DRAIN,
     RESPAWN_DELAY,
     Next,
@@ -14,7 +14,7 @@ from knee_gap_bringup.launch_plan import (
     exit_code_of,
     reaction,
 )
-from knee_gap_bringup.processes import GRACE, executable
+from knee_gap_bringup.launching.processes import GRACE, executable
 
 STOPS = (signal.SIGINT, signal.SIGTERM)
 LOOK = 0.05

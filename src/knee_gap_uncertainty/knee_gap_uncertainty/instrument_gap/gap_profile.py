@@ -11,7 +11,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeSection
-from knee_gap_uncertainty.instrument_gap import (
+from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     ROUGHNESS_BOUND,
     TILTS,
     Edges,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 
-from knee_gap_bringup.launch_plan import RESPAWN_DELAY, live_plan, live_problem
-from knee_gap_bringup.supervisor import supervise
+from knee_gap_bringup.launching.plan import RESPAWN_DELAY, live_plan, live_problem
+from knee_gap_bringup.launching.supervisor import supervise
 from knee_gap_core.node.command_line import Parser
 
 

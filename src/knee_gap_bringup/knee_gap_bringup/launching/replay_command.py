@@ -4,8 +4,8 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from knee_gap_bringup.launch_plan import replay_plan, replay_problem
-from knee_gap_bringup.supervisor import supervise
+from knee_gap_bringup.launching.plan import replay_plan, replay_problem
+from knee_gap_bringup.launching.supervisor import supervise
 from knee_gap_core.node.command_line import Parser
 
 

@@ -1,0 +1,1 @@
+"""What a launch starts, in which order, and how it ends."""
