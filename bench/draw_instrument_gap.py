@@ -12,6 +12,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
@@ -23,11 +24,12 @@ REACH = 10.0
 TISSUE, LINE, BLUE, ORANGE, GREEN = "#e8d8c4", "#5b4a3a", "#1f6fb4", "#d9731a", "#2f8f46"
 
 
-def tangent() -> np.ndarray:
+def tangent() -> npt.NDArray[np.float64]:
     """Where the line of sight from the lens touches the bone (2,)."""
     distance = float(np.linalg.norm(BONE))
     angle = np.arctan2(BONE[1], BONE[0]) - np.arcsin(RADIUS / distance)
-    return np.sqrt(distance**2 - RADIUS**2) * np.array([np.cos(angle), np.sin(angle)])
+    length = float(np.sqrt(distance**2 - RADIUS**2))
+    return np.array([length * np.cos(angle), length * np.sin(angle)])
 
 
 def draw(axes: Axes) -> None:
@@ -43,7 +45,8 @@ def draw(axes: Axes) -> None:
     middle = contact / np.linalg.norm(contact) + RIM / np.linalg.norm(RIM)
     middle /= np.linalg.norm(middle)
     axes.annotate("", 26.0 * middle, 19.5 * middle, arrowprops={"arrowstyle": "->", "color": BLUE})
-    axes.text(*(26.3 * middle), "view through\nthe middle", color=BLUE, va="center", fontsize=9)
+    x, y = 26.3 * middle
+    axes.text(x, y, "view through\nthe middle", color=BLUE, va="center", fontsize=9)
     best, normal, low, high = 0.0, np.zeros(2), 0.0, 0.0
     about = np.arctan2(middle[1], middle[0])
     for tilt in about + np.radians(np.linspace(-10.0, 10.0, 201)):

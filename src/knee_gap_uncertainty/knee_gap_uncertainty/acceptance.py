@@ -21,6 +21,7 @@ from knee_gap_core.values.errors import (
     UnderconstrainedError,
 )
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.rejection import Rejection
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal
@@ -68,17 +69,6 @@ class Reason(StrEnum):
     GAP_TOO_LARGE = "the gap is larger than any joint's"
     BOUND_TOO_LARGE = "the largest gap that the errors admit is larger than any joint's"
     BOUNDS_DISAGREE = "the estimate from all views lies outside the bounds from two of them"
-
-
-class Rejection(NamedTuple):
-    """Why an estimate is not VALID: the reason, which is counted, and what is particular to this image."""
-
-    reason: Reason
-    detail: str = ""
-
-    def __str__(self) -> str:
-        """The detail, or the reason where there is none."""
-        return self.detail or self.reason.value
 
 
 class Kept(Enum):

@@ -112,8 +112,8 @@ def test_with_the_right_radius_the_gap_is_that_between_the_cylinders(seed):
     scene = some_cylinders(np.random.default_rng(seed))
     opening = opening_of(bearings(scene.points), scene.edges)
     ranges = np.linalg.norm(scene.points, axis=1)
-    shapes = [np.array([[radius, 1.0]]) for radius in scene.radii]
-    found = widest(opening.half, ranges, opening.insets, *shapes, TILTS)[0]
+    first, second = (np.array([[radius, 1.0]]) for radius in scene.radii)
+    found = widest(opening.half, ranges, opening.insets, first, second, TILTS)[0]
     # The distance by which an arc leaves its tangent is taken to second order.
     assert found == pytest.approx(scene.gap(), abs=0.03e-3)
 

@@ -6,6 +6,13 @@ import numpy as np
 import pytest
 
 from knee_gap_core.values.errors import BadInputError
+from knee_gap_uncertainty.instrument_gap.instrument_gap import (
+    KIND_RIM,
+    Edges,
+    opening_of,
+    widest_gap,
+    worst_case,
+)
 from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdvicePace
 from knee_gap_uncertainty.motion_advice.motion_advice import (
     AdviceParameters,
@@ -17,9 +24,12 @@ from knee_gap_uncertainty.motion_advice.motion_advice import (
     width_after,
 )
 from knee_gap_uncertainty.multi_view.views import Views
-from knee_gap_uncertainty.two_view.gap_range import gap_range
+from knee_gap_uncertainty.two_view.angle_sets import SIGNS
+from knee_gap_uncertainty.two_view.translation_volume import displacements
 
 POINTS = np.array([[0.0, -0.002, 0.010], [0.0, 0.002, 0.010]])
+# Where faces at 45 degrees to the lines of sight of a lens at the origin would end.
+EDGES = np.array([[0.0, -0.00165, 0.01026], [0.0, 0.00165, 0.01026]])
 SIDEWAYS = np.array([1.0, 0.0, 0.0])
 
 
@@ -49,24 +59,32 @@ def situation(
         points=POINTS,
         direction=direction,
         angular_error=angular_error,
+        image_error=0.5 * angular_error,
         translation_error=3.7e-5,
         interval="worst_case",
         apex="best",
         confidence_level=0.95,
         views=views,
+        edges=Edges(unit(EDGES - lens[-1]), np.full(2, 1e-3), 3e-3, (KIND_RIM, KIND_RIM)),
     )
 
 
 def snr_at(now: Situation, lens: np.ndarray) -> float:
-    return gap_range(
-        now.first_lens,
-        lens,
-        unit(POINTS - now.first_lens),
+    """The ratio that the bounds of the gap really have from a lens that sees the same edges."""
+    edges = now.edges._replace(bearings=unit(EDGES - lens))
+    opening = opening_of(unit(POINTS - lens), edges.bearings)
+    lower, upper = worst_case(
+        now.first_lens - lens,
         unit(POINTS - lens),
-        angular_error=now.angular_error,
-        translation_error=now.translation_error,
-        apex="best",
-    ).snr
+        unit(POINTS - now.first_lens),
+        opening,
+        edges,
+        now.angular_error,
+        now.image_error,
+        displacements(now.translation_error, 1),
+        SIGNS["all"],
+    )
+    return widest_gap(POINTS, lens, opening, edges) / (upper - lower)
 
 
 def test_advised_travel_reaches_the_target_and_less_does_not() -> None:

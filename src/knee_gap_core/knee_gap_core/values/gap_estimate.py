@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from knee_gap_uncertainty.acceptance import Rejection
+from knee_gap_core.values.rejection import Rejection
 
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
@@ -134,7 +132,7 @@ class GapEstimate:
     translation_to_target: float = NAN
     points: npt.NDArray[np.float64] = field(default_factory=lambda: np.full((2, 3), NAN))
     shares: npt.NDArray[np.float64] = field(default_factory=lambda: np.full(6, NAN))
-    rejection: "Rejection | None" = None
+    rejection: Rejection | None = None
 
     @property
     def reason(self) -> str:

@@ -1,0 +1,15 @@
+"""Why a number is not given: a reason to count by, and what is particular to the case."""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class Rejection(NamedTuple):
+    """A reason in constant words, which is counted, and the detail of this case; empty if there is none."""
+
+    reason: StrEnum
+    detail: str = ""
+
+    def __str__(self) -> str:
+        """The detail, or the reason where there is none."""
+        return self.detail or self.reason.value
