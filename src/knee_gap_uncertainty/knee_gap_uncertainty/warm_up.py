@@ -64,7 +64,8 @@ def _edges(
     """The points as that lens sees them."""
     bearings = (points - lens) / np.linalg.norm(points - lens, axis=1, keepdims=True)
     planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
-    return EdgeObservation(stamp_ns, 1, True, bearings, SIGMA**2 * planes, 3.0 * SIGMA)
+    edges = EdgeObservation(stamp_ns, 1, True, bearings, SIGMA**2 * planes, 3.0 * SIGMA)
+    return edges.with_rims_at_points()
 
 
 if __name__ == "__main__":

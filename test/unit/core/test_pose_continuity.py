@@ -133,3 +133,27 @@ def test_another_frame_and_stamps_that_run_backwards_begin_a_segment() -> None:
     assert take(9 * 8_333_333, "femur") == 1  # the same once more
     assert take(8_333_333, "femur") == 2
     assert "backwards" in continuity.reason
+
+
+def test_a_slow_tracker_is_followed_once_its_period_is_known():
+    continuity = PoseContinuity()
+    segments = []
+    for k in range(40):
+        seconds = k / 30.0
+        place = np.array([0.05, 0.0, 0.02]) * seconds
+        segments.append(
+            continuity.take(round(1e9 * seconds), "world", place, [0.0, 0.0, 0.0, 1.0], 1e-12 * np.eye(6))
+        )
+    assert len(set(segments[3:])) == 1
+
+
+def test_one_long_gap_is_not_taken_for_the_period_of_a_slow_tracker():
+    continuity = PoseContinuity()
+    times = [*np.arange(0.0, 0.5, 1 / 120), *np.arange(0.6, 1.0, 1 / 120)]
+    segments = [
+        continuity.take(
+            round(1e9 * t), "world", [0.02 * t, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], 1e-12 * np.eye(6)
+        )
+        for t in times
+    ]
+    assert segments[0] != segments[-1]

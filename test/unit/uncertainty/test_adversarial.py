@@ -103,7 +103,7 @@ class Scope:
         return self.edges_reported(
             EdgeObservation(
                 SECOND + round(t * 1e9), 1, True, bearings, covariances, angular_error=3.0 * SIGMA
-            ),
+            ).with_rims_at_points(),
             t,
         )
 
@@ -125,7 +125,10 @@ class Scope:
         wrong = []
         for estimate in estimates:
             gap = self.gap((estimate.stamp_ns - SECOND) / 1e9)
-            if estimate.status is GapStatus.VALID and not estimate.gap_min <= gap <= estimate.gap_max:
+            if (
+                estimate.status is GapStatus.VALID
+                and not estimate.point_distance_min <= gap <= estimate.point_distance_max
+            ):
                 wrong.append(estimate)
         return wrong
 
@@ -148,7 +151,7 @@ def test_nothing_wrong_is_measured(scope: Scope) -> None:
     assert valid_share(estimates) > 0.7
     assert not scope.outside(estimates)
     last = estimates[-1]
-    assert last.confidence_min <= scope.gap(2.5) <= last.confidence_max
+    assert last.point_distance_confidence_min <= scope.gap(2.5) <= last.point_distance_confidence_max
 
 
 def test_pose_that_freezes_while_the_scope_goes_on(scope: Scope) -> None:
@@ -212,7 +215,12 @@ def test_point_that_slips_along_its_ray_is_told_by_the_leg_body_only() -> None:
         for watched in (False, True):
             scope = Scope(np.random.default_rng(seed))
             slips(scope)
-            parameters = EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3 if watched else 0.0)
+            parameters = EstimatorParameters(
+                **EXACT_SCOPE,
+                leg_motion=0.5e-3 if watched else 0.0,
+                tracker_drift=0.0,
+                tracker_angular_drift=0.0,
+            )
             estimates = scope.estimates(GapEstimator(parameters))
             wrong[watched] += len(scope.outside(estimates))
             if watched:

@@ -41,7 +41,8 @@ def edges(stamp_ns: int, x: float, track_id: int = 1, usable: bool = True) -> Ed
     bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     sigma = np.radians(0.1)
     covariances = sigma**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
-    return EdgeObservation(stamp_ns, track_id, usable, bearings, covariances, angular_error=np.radians(0.3))
+    seen = EdgeObservation(stamp_ns, track_id, usable, bearings, covariances, angular_error=np.radians(0.3))
+    return seen.with_rims_at_points()
 
 
 def run(
@@ -63,8 +64,8 @@ def test_one_estimate_an_image_and_exact_for_exact_views() -> None:
     assert [e.stamp_ns for e in estimates] == [10**9 + k * FRAME_NS for k in range(60)]
     last = estimates[-1]
     assert last.status is GapStatus.VALID
-    assert last.gap == pytest.approx(TRUE_GAP, abs=1e-7)
-    assert last.gap_min < TRUE_GAP < last.gap_max
+    assert last.point_distance == pytest.approx(TRUE_GAP, abs=1e-7)
+    assert last.point_distance_min < TRUE_GAP < last.point_distance_max
     assert last.baseline == pytest.approx(0.006)
     assert last.points == pytest.approx(POINTS, abs=1e-7)
     assert 20 <= last.view_count <= 60  # views that are too close to others are not kept
@@ -77,10 +78,12 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
         parameters = EstimatorParameters(**EXACT_SCOPE, scale_drift=drift, correlated_error_share=share)
         last = run(GapEstimator(parameters), positions)[-1]
         assert last.status is GapStatus.VALID
-        widths.append(last.confidence_max - last.confidence_min)
+        widths.append(last.point_distance_confidence_max - last.point_distance_confidence_min)
     assert widths[0] < 0.99 * widths[1] < 0.98 * widths[2]
     default = run(GapEstimator(EXACT), positions)[-1]
-    assert default.confidence_max - default.confidence_min == pytest.approx(widths[2])
+    assert default.point_distance_confidence_max - default.point_distance_confidence_min == pytest.approx(
+        widths[2]
+    )
 
 
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
@@ -97,7 +100,7 @@ def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
         apex="best",
     )
     # The interpolated pose carries the bend of the path between its neighbours, about 1e-9 m here.
-    assert (estimate.gap_min, estimate.gap_max) == pytest.approx(
+    assert (estimate.point_distance_min, estimate.point_distance_max) == pytest.approx(
         (expected.gap_min, expected.gap_max), abs=1e-6
     )
 
@@ -369,7 +372,9 @@ def test_a_scope_that_comes_back_elsewhere_begins_a_new_track(unseen: float) -> 
         estimator.add_pose(pose(stamp - MS, x + 0.03), stamp)
         back += estimator.add_edges(edges(stamp, x), stamp)
         back += estimator.add_pose(pose(stamp + MS, x + 0.03), stamp)
-    assert not [one for one in back if one.status is GapStatus.VALID and abs(one.gap - TRUE_GAP) > 1e-4]
+    assert not [
+        one for one in back if one.status is GapStatus.VALID and abs(one.point_distance - TRUE_GAP) > 1e-4
+    ]
     assert max(one.baseline for one in back if math.isfinite(one.baseline)) < 0.003
     assert sum(n for key, n in estimator.counts.items() if key.startswith("tracks ended")) == 1
 

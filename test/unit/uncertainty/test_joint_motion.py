@@ -63,7 +63,7 @@ def observe(
                 bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
                 outer = bearings[:, :, None] * bearings[:, None, :]
                 edges = EdgeObservation(stamp, 1, True, bearings, SIGMA**2 * (np.eye(3) - outer), BOUND)
-                estimates += estimator.add_edges(edges, stamp)
+                estimates += estimator.add_edges(edges.with_rims_at_points(), stamp)
     return estimates
 
 
@@ -83,7 +83,11 @@ def jump(count: int, images: slice, angle_deg: float, towards_deg: float) -> Arr
 
 def missed(estimates: list[GapEstimate]) -> list[GapEstimate]:
     """Valid estimates whose bounds do not hold the truth."""
-    return [e for e in estimates if e.status is GapStatus.VALID and not e.gap_min <= TRUE_GAP <= e.gap_max]
+    return [
+        e
+        for e in estimates
+        if e.status is GapStatus.VALID and not e.point_distance_min <= TRUE_GAP <= e.point_distance_max
+    ]
 
 
 @pytest.mark.parametrize("towards_deg", [0.0, 11.3, 90.0, 200.0, 300.0])
@@ -146,8 +150,8 @@ def test_joint_that_moves_ends_the_track_and_the_next_one_is_right() -> None:
     new_gap = float(np.linalg.norm(points[-1, 1] - points[-1, 0]))
     last = estimates[-1]
     assert last.status is GapStatus.VALID
-    assert last.gap_min < new_gap < last.gap_max
-    assert last.gap == pytest.approx(new_gap, abs=0.2e-3)
+    assert last.point_distance_min < new_gap < last.point_distance_max
+    assert last.point_distance == pytest.approx(new_gap, abs=0.2e-3)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

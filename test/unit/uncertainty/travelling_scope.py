@@ -94,7 +94,7 @@ def observed(
     edges = EdgeObservation(
         stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3,
         camera_errors=np.einsum("ij,kic->kjc", rotation, errors),
-    )  # fmt: skip
+    ).with_rims_at_points()  # fmt: skip
     quaternion = Rotation.from_matrix(rotation).as_quat()
     covariance = np.diag([1e-10] * 3 + [1e-9] * 3)
     return edges, LensPose(stamp_ns, "world", views.lens_positions[k], quaternion, covariance)
@@ -142,5 +142,5 @@ def travelling(
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         edges = EdgeObservation(stamp, 1, True, bearings, bearing_covariances(bearings, sigma), 3.0 * sigma)
         estimator.add_pose(pose, stamp)
-        found += estimator.add_edges(edges, stamp)
+        found += estimator.add_edges(edges.with_rims_at_points(), stamp)
     return found

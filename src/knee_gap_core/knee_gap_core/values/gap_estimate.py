@@ -1,6 +1,6 @@
 """What is published of the gap, and of an observation of its edges: the values that go in and come out."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -11,6 +11,8 @@ from knee_gap_core.values.rejection import Rejection
 NAN = float("nan")
 # Rounding on the way, not a wrong vector.
 UNIT_TOLERANCE = 1e-6
+# Kind of an edge, of knee_gap_msgs/GapEdges, and standard deviation of an edge that is all but exact [rad].
+RIM, RIM_DEVIATION = 1, 1e-4
 ROUNDING = 1e-6
 
 
@@ -77,6 +79,13 @@ class EdgeObservation:
     kinds: tuple[int, int] = (0, 0)
     section: EdgeSection = field(default_factory=lambda: EdgeSection())
     sections: tuple[EdgeSection, ...] = ()
+
+    def with_rims_at_points(self) -> "EdgeObservation":
+        """The same, with the points as rims of the opening: for scopes simulated without pictures."""
+        rims = EdgeSection(
+            (EdgeState.SEEN, EdgeState.SEEN), self.bearings, np.full(2, RIM_DEVIATION), 3.0 * RIM_DEVIATION
+        )
+        return replace(self, kinds=(RIM, RIM), section=rims)
 
     def flaw(self) -> str:
         """Why the observation cannot be used, in words; empty if it can."""

@@ -31,6 +31,10 @@ MOTION_TIME_NS = 15_000_000  # over which the velocity before a gap is taken
 # A pose that is lost costs two: the one after a gap of more than two periods is refused as well.
 GAP_PERIODS = 4.25  # of the tracker, the longest gap over which its motion is extrapolated
 SHORTEST_GAP_NS = 25_000_000  # that is taken for an occlusion, however fast the tracker
+# A tracker slower than SHORTEST_GAP_NS shows its period by intervals in a row that are alike.
+SLOWEST_PERIOD_NS = 100_000_000
+ALIKE = 3  # intervals
+ALIKE_RATIO = 1.25  # of the longest to the shortest
 KEPT = 31  # poses
 
 
@@ -54,6 +58,7 @@ class PoseContinuity:
         self._frame_id = ""
         self._poses: deque[_Pose] = deque(maxlen=KEPT)
         self._intervals_ns: deque[int] = deque(maxlen=KEPT - 1)
+        self._latest_ns: deque[int] = deque(maxlen=ALIKE)
 
     def take(
         self,
@@ -81,6 +86,7 @@ class PoseContinuity:
             interval_ns = stamp_ns - self._poses[-1].stamp_ns
             if frame_id == self._frame_id and interval_ns == 0:
                 return self.segment
+            self._latest_ns.append(interval_ns)
             if reason := self._break(pose, frame_id):
                 self.segment, self.reason = self.segment + 1, reason
                 self._poses.clear()
@@ -108,6 +114,9 @@ class PoseContinuity:
     def _longest_gap_ns(self) -> float:
         """Longest time between two poses that is no occlusion [ns]."""
         usual = median(self._intervals_ns) if self._intervals_ns else 0.0
+        latest = self._latest_ns
+        if len(latest) == ALIKE and 0 < max(latest) <= min(ALIKE_RATIO * min(latest), SLOWEST_PERIOD_NS):
+            usual = max(usual, median(latest))
         return max(GAP_PERIODS * usual, SHORTEST_GAP_NS)
 
     def _follows(self, last: _Pose, pose: _Pose) -> bool:

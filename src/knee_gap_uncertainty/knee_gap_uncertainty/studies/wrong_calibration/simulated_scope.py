@@ -116,6 +116,8 @@ def wrong_scope(
                 bearings = hand.bearings(time, points) + np.column_stack([noise, np.zeros(2)])
                 bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
                 covariances = bearing_covariances(bearings, SIGMA)
-                edges = EdgeObservation(stamp, 1, True, bearings, covariances, 3.0 * SIGMA)
+                edges = EdgeObservation(
+                    stamp, 1, True, bearings, covariances, 3.0 * SIGMA
+                ).with_rims_at_points()
                 found += estimator.add_edges(edges, stamp)
     return found
