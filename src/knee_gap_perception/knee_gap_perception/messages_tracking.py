@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from knee_gap_core.values.poses import BodyPose, LensPose
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.camera_errors import pupil_shift
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.messages import stamp_ns

@@ -10,13 +10,8 @@ import pytest
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
 from knee_gap_core.values.rigid_transforms import to_vector
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    LensOnBody,
-    Oblique,
-    load_calibration,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration, LensOnBody, Oblique
+from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError

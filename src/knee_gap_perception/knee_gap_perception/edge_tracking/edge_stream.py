@@ -15,7 +15,7 @@ import numpy as np
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.pose_interpolation import LensPosePredictor
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.agreement import disagreement
 from knee_gap_perception.camera.bearing_errors import BearingErrors
 from knee_gap_perception.camera.camera_errors import CameraErrors, ErrorSource

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.poses import BodyPose, LensPose, cross_matrix, rigid_transform
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
 from knee_gap_perception.scope_pose.pose_validity import (
