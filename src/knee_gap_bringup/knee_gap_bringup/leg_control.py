@@ -73,7 +73,7 @@ class Estimate(NamedTuple):
             gap_min=message.gap_min,
             gap_max=message.gap_max,
             interval=INTERVALS.get(message.interval, f"number {message.interval}"),
-            stamp_ns=stamp_ns,
+            stamp_ns=stamp,
             sequence=sequence,
         )
 

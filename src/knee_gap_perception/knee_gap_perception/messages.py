@@ -126,7 +126,6 @@ def lens_pose_from_message(message: Any) -> LensPose:
     return LensPose(
         stamp_ns=stamp_ns(message.header),
         frame_id=str(message.header.frame_id),
-        child_frame_id="",
         position=position,
         quaternion_xyzw=quaternion,
         covariance=covariance,

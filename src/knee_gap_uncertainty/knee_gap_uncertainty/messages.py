@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
+from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice
