@@ -191,7 +191,7 @@ def lens_pose(frame: SimulatorFrame) -> LensPose:
     T = frame.T_world_lens_tracked
     covariance = np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3)
     quaternion = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return LensPose(frame.stamp_ns, "world", "arthroscope_optical", T[:3, 3], quaternion, covariance)
+    return LensPose(frame.stamp_ns, "world", T[:3, 3], quaternion, covariance)
 
 
 def score(simulator: KneeSimulator, *, posed: bool, keep: Path | None = None) -> Scores:

@@ -26,6 +26,7 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_replay.pipeline import PARAMETERS, GapPipeline
 from knee_gap_replay.processing import by_stamp
 from knee_gap_replay.topics import InputTopics
@@ -39,7 +40,6 @@ from knee_gap_simulation.recordings.recording import (
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.messages import stamp_ns
 
 LARGEST_SHARE, LARGEST_MISS = 1e-3, 0.5e-3  # of a creeping body: share of VALID, and by how much [m]
 SPACE = "/knee_gap"
@@ -121,7 +121,7 @@ def late(seconds: float) -> Fault:
     def fault(given: Faulty) -> None:
         if given.topic == BODY_POSE:
             stamp = stamp_ns(given.message.header) + round(seconds * 1e9)
-            given.message.header.stamp.sec, given.message.header.stamp.nanosec = divmod(stamp, 10**9)
+            set_stamp(given.message.header, stamp)
 
     return fault
 

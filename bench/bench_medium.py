@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera_errors import WINDOW_TILT, CameraErrors, pupil_shift
 from knee_gap_perception.camera.medium import AIR, SALINE
 from knee_gap_perception.camera.models import Camera, bearing_jacobian, camera_from_info, camera_in_medium
 from knee_gap_simulation.recordings.recording import camera_info_message
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
 GAP = 0.004

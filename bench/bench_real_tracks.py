@@ -165,7 +165,7 @@ def gap_points(scene: Reconstruction) -> None:
     for index, image in enumerate(scene.images):
         T = scene.poses[index]
         quaternion = quaternion_of(T[:3, :3])
-        pose = LensPose(index * FRAME_NS, "world", "lens", T[:3, 3], quaternion, covariance)
+        pose = LensPose(index * FRAME_NS, "world", T[:3, 3], quaternion, covariance)
         edges = detector.process(index * FRAME_NS, image, scene.camera, pose)
         if edges.status is not EdgeStatus.VALID:
             continue

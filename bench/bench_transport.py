@@ -20,8 +20,8 @@ import numpy as np
 from knee_gap_bringup.launching.processes import Processes, StartError, executable
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
-from knee_gap_uncertainty.messages import stamp_ns
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "bags" / "sample"
@@ -89,7 +89,7 @@ def to_and_fro(path: Path, seconds: float) -> Path:
                         pending.append((new + entry.time_ns - stamp, new, entry))
             for time_ns, new, entry in sorted(pending, key=lambda item: (item[0], item[2].topic)):
                 message = reader.deserialize(entry)
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(new, 10**9)
+                set_stamp(message.header, new)
                 writer.write(entry.topic, message, time_ns)
     (path / PARAMETERS_FILE).write_bytes((SAMPLE / PARAMETERS_FILE).read_bytes())
     return path

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
@@ -50,7 +51,7 @@ def camera() -> CameraInfo:
 def image_message(picture: np.ndarray, stamp_ns: int, encoding: str = "bgr8") -> Image:
     message = Image(height=picture.shape[0], width=picture.shape[1], encoding=encoding)
     message.step = picture.strides[0]
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     message.header.frame_id = "arthroscope_optical"
     message.data = picture.tobytes()
     return message
@@ -155,7 +156,7 @@ def test_mask_and_overlay_are_there_once_somebody_listens(
 def pose_message(stamp_ns: int, x: float = 0.0, w: float = 1.0) -> PoseStamped:
     message = PoseStamped()
     message.header.frame_id = "world"
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     message.pose.position.x = x
     message.pose.orientation.w = w
     return message

@@ -20,6 +20,7 @@ from sensor_msgs.msg import CameraInfo
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.stamps import set_stamp
 
 DOMAIN = 61
 IMAGE, INFO, POSE = "/image", "/info", "/pose"
@@ -46,7 +47,7 @@ def write(path: Path, *, seconds: float, raw: bool = False) -> Path:
             stamp_ns = index * 1_000_000_000 // 120
             pose = blank("geometry_msgs/msg/PoseStamped")
             for message in (image, pose):
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+                set_stamp(message.header, stamp_ns)
             bag.write(POSE, pose, stamp_ns)
             if index % 2 == 0:
                 image.data[:8] = rng.integers(0, 256, 8, dtype=np.uint8)

@@ -15,6 +15,7 @@ from knee_gap_bringup.comparison import EDGES, GAP
 from knee_gap_bringup.demo import play_through_nodes
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_perception.trackers.motive_csv import read_take
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
@@ -37,7 +38,7 @@ pytestmark = [
 
 
 def stamped(message: Any, stamp_ns: int, frame_id: str) -> Any:
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     message.header.frame_id = frame_id
     return message
 

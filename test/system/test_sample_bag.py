@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_bringup.launching.processes import executable
 from knee_gap_core.bag.bag import BagReader
-from knee_gap_uncertainty.messages import stamp_ns
+from knee_gap_core.values.stamps import stamp_ns
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "bags" / "sample"

@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_msgs.srv import ChoosePoint
 from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
@@ -70,7 +71,7 @@ class Feed:
     def publish(self, picture: np.ndarray, encoding: str, stamp_ns: int) -> None:
         message = Image(height=picture.shape[0], width=picture.shape[1], encoding=encoding)
         message.step = picture.strides[0]
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        set_stamp(message.header, stamp_ns)
         message.header.frame_id = "arthroscope_optical"
         message.data = picture.tobytes()
         self.client.publish("image_raw", message)
@@ -82,7 +83,7 @@ class Feed:
     def pose(self, stamp_ns: int) -> None:
         message = PoseWithCovarianceStamped()
         message.header.frame_id = "world"
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        set_stamp(message.header, stamp_ns)
         message.pose.pose.orientation.w = 1.0
         message.pose.covariance = np.diag([4e-10] * 3 + [1e-10] * 3).ravel()
         self.client.publish("scope_pose", message)

@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from live import Client
 
 from knee_gap_bringup.launching.processes import Processes, executable
+from knee_gap_core.values.stamps import set_stamp
 
 DOMAIN = 53
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -84,7 +85,7 @@ def test_leg_as_reference(tmp_path: Path) -> None:
             shift = 1e-4 * k
             for topic, offset in (("reference_body/pose", 0.0), ("scope_body/pose", 0.1)):
                 message = PoseStamped()
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(10**18 + k * 8_333_333, 10**9)
+                set_stamp(message.header, 10**18 + k * 8_333_333)
                 message.header.frame_id = "world"
                 message.pose.position.x = offset + shift + rng.normal(0.0, 1e-6)
                 message.pose.orientation.w = 1.0

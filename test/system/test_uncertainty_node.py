@@ -21,6 +21,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from knee_gap_bringup.launching.processes import Processes, executable
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE
 
@@ -42,7 +43,7 @@ def edges_message(stamp_ns: int, x: float, status: int = GapEdges.STATUS_VALID) 
     towards = POINTS - [x, 0.0, 0.0]
     bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     message = GapEdges(status=status, track_id=1, angular_error=math.radians(0.3))
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     for vector, bearing in zip((message.bearing_0, message.bearing_1), bearings, strict=True):
         vector.x, vector.y, vector.z = (float(value) for value in bearing)
     variance = math.radians(0.1) ** 2
@@ -54,7 +55,7 @@ def edges_message(stamp_ns: int, x: float, status: int = GapEdges.STATUS_VALID) 
 def pose_message(stamp_ns: int, x: float) -> PoseWithCovarianceStamped:
     message = PoseWithCovarianceStamped()
     message.header.frame_id = "world"
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     message.pose.pose.position.x = x
     message.pose.pose.orientation.w = 1.0
     message.pose.covariance = np.diag([1e-12] * 6).ravel()
@@ -62,7 +63,7 @@ def pose_message(stamp_ns: int, x: float) -> PoseWithCovarianceStamped:
 
 
 def stamp_of(message: GapEstimate) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+    return stamp_ns(message.header)
 
 
 class Track:

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_simulation.rigid import from_parts
-from knee_gap_uncertainty.messages import stamp_ns
 
 Floats = npt.NDArray[np.float64]
 EDGES = "/knee_gap/gap_edges"

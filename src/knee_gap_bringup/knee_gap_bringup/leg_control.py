@@ -11,10 +11,11 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any, NamedTuple, Self
 
+from knee_gap_core.values.stamps import NANOSECONDS, stamp_ns
+
 # GapEstimate's constants, for a core without messages; a test compares them.
 STATUS_VALID = 1
 INTERVALS = {0: "worst_case", 1: "paper"}
-NANOSECONDS = 1_000_000_000
 
 # How far in the future a stamp may lie: clocks of two machines that are kept in step [s].
 MOST_AHEAD = 0.05
@@ -63,16 +64,16 @@ class Estimate(NamedTuple):
     @classmethod
     def from_message(cls, message: Any, now_ns: int, sequence: int | None = None) -> Self:
         """Return what a GapEstimate, of rclpy or of a bag, states when the node's clock is `now_ns`."""
-        stamp_ns = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        stamp = stamp_ns(message.header)
         return cls(
             is_valid=message.status == STATUS_VALID,
             track_id=message.track_id,
-            age=(now_ns - stamp_ns) / NANOSECONDS,
+            age=(now_ns - stamp) / NANOSECONDS,
             gap=message.gap,
             gap_min=message.gap_min,
             gap_max=message.gap_max,
             interval=INTERVALS.get(message.interval, f"number {message.interval}"),
-            stamp_ns=stamp_ns,
+            stamp_ns=stamp,
             sequence=sequence,
         )
 

@@ -17,12 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    Clock,
-    LensOnBody,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody
+from knee_gap_perception.calibration.calibration_file import save_calibration
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.camera.medium import medium_of
 from knee_gap_perception.errors import PerceptionError

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import GapEdges, SectionEdges
 from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
 
 # Channels of each accepted encoding and what makes it blue, green, red.
@@ -22,11 +23,6 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "8UC1": (1, cv2.COLOR_GRAY2BGR),
     "8UC3": (3, None),
 }
-
-
-def stamp_ns(header: Any) -> int:
-    """Stamp of a std_msgs/Header [ns]; nanoseconds of a second and more count as the last of it."""
-    return int(header.stamp.sec) * 1_000_000_000 + min(int(header.stamp.nanosec), 999_999_999)
 
 
 def refuse_stamp(header: Any) -> None:
@@ -130,7 +126,6 @@ def lens_pose_from_message(message: Any) -> LensPose:
     return LensPose(
         stamp_ns=stamp_ns(message.header),
         frame_id=str(message.header.frame_id),
-        child_frame_id="",
         position=position,
         quaternion_xyzw=quaternion,
         covariance=covariance,

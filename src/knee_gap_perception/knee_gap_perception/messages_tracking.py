@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from knee_gap_core.values.poses import BodyPose, LensPose
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.camera_errors import pupil_shift
 from knee_gap_perception.camera.medium import Medium
-from knee_gap_perception.messages import stamp_ns
 from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
 
 NO_REASON = "the notch is not seen, and no reason was told"
@@ -89,7 +89,7 @@ def fill_scope_rotation(message: Any, lens: LensPose) -> Any:
 
 def fill_scope_notch(message: Any, observation: NotchObservation, frame_id: str) -> Any:
     """Set every field of a knee_gap_msgs/ScopeNotch; returns the message."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(observation.stamp_ns, 1_000_000_000)
+    set_stamp(message.header, observation.stamp_ns)
     message.header.frame_id = frame_id
     message.seen, message.reason = observation.seen, observation.reason
     message.angle, message.angle_error = float(observation.angle), float(observation.angle_error)
@@ -107,7 +107,7 @@ def notch_from_message(message: Any) -> NotchObservation:
 
 
 def _fill_header(header: Any, lens: LensPose) -> None:
-    header.stamp.sec, header.stamp.nanosec = divmod(lens.stamp_ns, 1_000_000_000)
+    set_stamp(header, lens.stamp_ns)
     header.frame_id = lens.frame_id
 
 

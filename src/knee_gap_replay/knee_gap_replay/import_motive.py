@@ -15,12 +15,12 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.node.command_line import Parser, finite, not_negative, run
+from knee_gap_core.values.stamps import NANOSECONDS, set_stamp
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.trackers.motive_csv import Take, TakeBody, read_take
 from knee_gap_perception.trackers.up_axis import UP_AXES
 from knee_gap_replay.topics import namespace_from
 
-NANOSECONDS = 1_000_000_000
 # Stamps of ROS count seconds in 31 bits.
 _END_OF_STAMPS = 1 << 31
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -45,7 +45,7 @@ def write_take(
 
 def _pose(body: TakeBody, index: int, stamp_ns: int) -> Any:
     message = blank(POSE)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    set_stamp(message.header, stamp_ns)
     message.header.frame_id = "world"
     place, turn = message.pose.position, message.pose.orientation
     place.x, place.y, place.z = (float(value) for value in body.position[index])

@@ -19,6 +19,7 @@ from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.stamps import NANOSECONDS, set_stamp
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
@@ -45,7 +46,6 @@ from knee_gap_replay.topics import InputTopics
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.inputs.delays import NANOSECONDS
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 
 _LOG = logging.getLogger(__name__)
@@ -354,7 +354,7 @@ class GapPipeline:
 
 def _mask_message(edges: GapEdges, mask: npt.NDArray[np.uint8]) -> Any:
     message = blank("sensor_msgs/msg/Image")
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(edges.stamp_ns, NANOSECONDS)
+    set_stamp(message.header, edges.stamp_ns)
     message.header.frame_id, message.encoding = edges.frame_id, "mono8"
     message.height, message.width = mask.shape
     message.step, message.data = mask.shape[1], mask.ravel()

@@ -21,9 +21,10 @@ from knee_gap_core.values.errors import (
     UnderconstrainedError,
 )
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.rejection import Rejection
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
+from knee_gap_uncertainty.inputs.pose_buffer import PoseRefusal
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal
 from knee_gap_uncertainty.joint_motion.joint_motion import Finding
 

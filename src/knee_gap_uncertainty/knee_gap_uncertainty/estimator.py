@@ -13,12 +13,14 @@ import numpy as np
 
 from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_uncertainty.acceptance import Facts, Verdict, judge
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.gap_track import Track
-from knee_gap_uncertainty.inputs.delays import NANOSECONDS, DelayFloor
+from knee_gap_uncertainty.inputs.delays import DelayFloor
 from knee_gap_uncertainty.inputs.leg_body import LegBody
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal, ScopeRotation, ScopeRotations
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdviceTask

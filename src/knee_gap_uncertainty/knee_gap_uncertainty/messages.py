@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice
@@ -41,11 +42,6 @@ NUMBERS = (
     "parallax",
     "translation_to_target",
 )
-
-
-def stamp_ns(header: Any) -> int:
-    """Stamp of a std_msgs/Header [ns]."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def edges_from_message(message: Any) -> EdgeObservation:
@@ -133,7 +129,7 @@ def rotation_from_message(message: Any) -> ScopeRotation:
 
 def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
     """Set every field of a default-constructed knee_gap_msgs/GapEstimate; returns the message."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(estimate.stamp_ns, 1_000_000_000)
+    set_stamp(message.header, estimate.stamp_ns)
     message.header.frame_id = estimate.frame_id
     message.status = int(estimate.status)
     message.track_id = estimate.track_id
@@ -157,7 +153,7 @@ def fill_gap_estimate(message: Any, estimate: GapEstimate) -> Any:
 
 def fill_gap_profile(message: Any, profile: GapProfile) -> Any:
     """Set every field of a default-constructed knee_gap_msgs/GapProfile; returns the message."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(profile.stamp_ns, 1_000_000_000)
+    set_stamp(message.header, profile.stamp_ns)
     message.header.frame_id = profile.frame_id
     message.track_id = profile.track_id
     for name in ("position", "gap", "gap_min", "gap_max"):
@@ -169,7 +165,7 @@ def fill_gap_profile(message: Any, profile: GapProfile) -> Any:
 
 def fill_motion_advice(message: Any, advice: MotionAdvice, parameters: AdviceParameters) -> Any:
     """Set every field of a default-constructed knee_gap_msgs/MotionAdvice; returns the message."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(advice.stamp_ns, 1_000_000_000)
+    set_stamp(message.header, advice.stamp_ns)
     message.header.frame_id = advice.frame_id
     message.track_id = advice.track_id
     message.target_kind = TARGETS[parameters.advice_target]

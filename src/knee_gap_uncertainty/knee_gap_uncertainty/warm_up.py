@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.joint_motion import motion_statistics
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 from knee_gap_uncertainty.multi_view import maximum_likelihood as multi_view

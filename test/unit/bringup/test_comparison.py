@@ -11,12 +11,13 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_simulation.make_bag import Recording, make_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_simulation.rigid import from_parts, inverse, transform
-from knee_gap_uncertainty.messages import fill_gap_estimate, stamp_ns
+from knee_gap_uncertainty.messages import fill_gap_estimate
 
 TRACK = 4
 

@@ -14,6 +14,7 @@ from rosbags.interfaces import ConnectionExtRosbag2, QosDurability, QosReliabili
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank, typestore
+from knee_gap_core.values.stamps import set_stamp
 
 POSE = "geometry_msgs/msg/PoseStamped"
 EDGES = "knee_gap_msgs/msg/GapEdges"
@@ -21,7 +22,7 @@ EDGES = "knee_gap_msgs/msg/GapEdges"
 
 def pose(stamp_ns: int) -> Any:
     message = blank(POSE)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    set_stamp(message.header, stamp_ns)
     message.header.frame_id = "world"
     message.pose.position.x = stamp_ns * 1e-9
     return message

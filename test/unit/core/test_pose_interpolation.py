@@ -13,7 +13,7 @@ POSITION_ERROR = 2e-5  # [m] an axis
 
 def pose(stamp_ns: int, position: np.ndarray, turn: np.ndarray, frame_id: str = "world") -> LensPose:
     covariance = np.diag([POSITION_ERROR**2] * 3 + [1e-9] * 3)
-    return LensPose(stamp_ns, frame_id, "lens", position, Rotation.from_rotvec(turn).as_quat(), covariance)
+    return LensPose(stamp_ns, frame_id, position, Rotation.from_rotvec(turn).as_quat(), covariance)
 
 
 def even_motion(stamp_ns: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer
+from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer
 
 POINTS = np.array([[2e-3, -2e-3, 12e-3], [1e-3, 2.1e-3, 11e-3]])
 BEGIN_NS = BEGIN * 10**9

@@ -73,7 +73,7 @@ def test_prediction_of_the_lens_pose(messages: list[tuple[int, Any]], steps: lis
 def test_poses_at_the_notch(bodies: list[tuple[int, Any]], notches: list[Any]) -> None:
     def lens_of(tracked: Tracked, _: float, __: float) -> LensPose:
         body = tracked.body
-        return LensPose(body.stamp_ns, "w", "l", body.position, body.quaternion_xyzw, 1e-9 * np.eye(6))
+        return LensPose(body.stamp_ns, "w", body.position, body.quaternion_xyzw, 1e-9 * np.eye(6))
 
     turned = RotatedPoses(lens_of)
     observations = dict(zip(stamps([step for step, *_ in notches] or [0]), notches, strict=False))

@@ -11,16 +11,8 @@ import pytest
 from knee_gap_core.values.rigid_transforms import from_vector, to_vector
 from knee_gap_perception.calibrate.solvers.lens_error import lens_covariance, lens_errors
 from knee_gap_perception.calibration import calibration_file
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    Clock,
-    LensOnBody,
-    Oblique,
-    Tip,
-    load_calibration,
-    require_place,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody, Oblique, Tip
+from knee_gap_perception.calibration.calibration_file import load_calibration, require_place, save_calibration
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.errors import PerceptionError

@@ -12,13 +12,8 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    Clock,
-    LensOnBody,
-    Oblique,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody, Oblique
+from knee_gap_perception.calibration.calibration_file import save_calibration
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.agreement import disagreement
 from knee_gap_perception.camera.bearing_errors import BearingErrors

@@ -26,7 +26,7 @@ POSITION_ERROR = 2.1e-5  # [m] an axis: the tracker's 0.0367 mm
 def lens_pose(T: Array, rng: np.random.Generator) -> LensPose:
     covariance = np.diag([POSITION_ERROR**2] * 3 + [1e-10] * 3)
     position = T[:3, 3] + rng.normal(0, POSITION_ERROR, 3)
-    return LensPose(0, "world", "lens", position, Rotation.from_matrix(T[:3, :3]).as_quat(), covariance)
+    return LensPose(0, "world", position, Rotation.from_matrix(T[:3, :3]).as_quat(), covariance)
 
 
 def follow(joint: Any, travel: Travel, *, posed: bool) -> list[GapEdges]:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration, save_calibration
+from knee_gap_perception.calibration.calibration import Calibration
+from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.bearing_errors import BearingErrors
 from knee_gap_perception.camera.camera_errors import MOST_ERRORS, NEAR, PUPIL_DEPTH, CameraErrors, pupil_shift

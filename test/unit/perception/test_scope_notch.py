@@ -10,13 +10,9 @@ import pytest
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
 from knee_gap_core.values.rigid_transforms import to_vector
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    LensOnBody,
-    Oblique,
-    load_calibration,
-    save_calibration,
-)
+from knee_gap_core.values.stamps import set_stamp
+from knee_gap_perception.calibration.calibration import Calibration, LensOnBody, Oblique
+from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError
@@ -269,7 +265,7 @@ def test_a_notch_that_cannot_tell_the_turn_is_refused_at_the_start(
 
 def image(index: int, pixels: npt.NDArray[np.uint8]) -> Any:
     message = blank("sensor_msgs/msg/Image")
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp(index), 10**9)
+    set_stamp(message.header, stamp(index))
     message.height, message.width, message.encoding = *pixels.shape[:2], "bgr8"
     message.step, message.data = 3 * pixels.shape[1], pixels.ravel()
     return message

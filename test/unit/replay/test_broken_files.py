@@ -15,14 +15,8 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank
 from knee_gap_perception.calibrate import command as calibrate
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    Clock,
-    LensOnBody,
-    Tip,
-    load_calibration,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody, Tip
+from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_rotation.shaft_axis import Mount
 from knee_gap_perception.tracker_precision import command as tracker_precision_command

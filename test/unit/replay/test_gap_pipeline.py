@@ -13,6 +13,7 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 from knee_gap_replay.pipeline import GapPipeline
@@ -55,7 +56,7 @@ class TrueEdges:
         self.camera_seen = True
 
     def on_lens_pose(self, message: Any) -> None:
-        self.pose_stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+        self.pose_stamps.append(stamp_ns(message.header))
 
     def on_image(self, message: Any, now_ns: int) -> None:
         self.images.append(message)
@@ -69,11 +70,11 @@ class TrueEdges:
 
     def look(self, message: Any) -> GapEdges:
         assert self.camera_seen
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        T = lens_pose(stamp_ns)
+        stamp = stamp_ns(message.header)
+        T = lens_pose(stamp)
         bearings = (POINTS - T[:3, 3]) @ T[:3, :3]
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-        nothing = GapEdges.without_points(stamp_ns, "arthroscope_optical", EdgeStatus.VALID, track_id=1)
+        nothing = GapEdges.without_points(stamp, "arthroscope_optical", EdgeStatus.VALID, track_id=1)
         planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
         return replace(
             nothing,
@@ -86,7 +87,7 @@ class TrueEdges:
 
 def stamped(msgtype: str, stamp_ns: int) -> Any:
     message = blank(msgtype)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    set_stamp(message.header, stamp_ns)
     return message
 
 
@@ -194,7 +195,7 @@ def test_a_leg_body_that_moves_ends_the_track_and_one_that_rests_changes_nothing
         gap.gap for gap in alone if gap.status == VALID
     ]
     first = next(index for index, gap in enumerate(moves) if gap.status == JOINT_MOVED)
-    stamps = [gap.header.stamp.sec * 10**9 + gap.header.stamp.nanosec for gap in moves]
+    stamps = [stamp_ns(gap.header) for gap in moves]
     assert moves_ns <= stamps[first] < moves_ns + 3 * POSE_PERIOD_NS
     # What was seen before the move is no part of the new track.
     assert moves[first + 1].status == INSUFFICIENT_PARALLAX
@@ -211,9 +212,9 @@ def test_a_leg_body_that_is_lost_leaves_no_number() -> None:
 def test_lens_poses_are_those_of_the_body_with_the_lens_on_it() -> None:
     outputs = run(500_000_000, 500_000_000)
     for pose in on(outputs, "/space/scope_pose"):
-        stamp_ns = pose.header.stamp.sec * 10**9 + pose.header.stamp.nanosec
+        stamp = stamp_ns(pose.header)
         p = pose.pose.pose.position
-        np.testing.assert_allclose([p.x, p.y, p.z], lens_pose(stamp_ns)[:3, 3], atol=1e-12)
+        np.testing.assert_allclose([p.x, p.y, p.z], lens_pose(stamp)[:3, 3], atol=1e-12)
 
 
 def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
@@ -222,8 +223,8 @@ def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
     gaps = on(outputs, "/space/gap")
     assert len(gaps) == 180
     for gap in gaps:
-        stamp_ns = gap.header.stamp.sec * 10**9 + gap.header.stamp.nanosec
-        if stamp_ns > 2_000_000_000:
+        stamp = stamp_ns(gap.header)
+        if stamp > 2_000_000_000:
             assert gap.status == TRACKING_LOST
 
 

@@ -12,6 +12,7 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.bag.qos import QosName
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_replay.processing import Output, by_stamp, process
 
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -23,7 +24,7 @@ def write(path: Path, records: Iterable[tuple[str, int, int]]) -> Path:
         for topic, stamp_ms, record_ms in records:
             bag.add_topic(topic, POSE)
             message = blank(POSE)
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ms * 1_000_000, 10**9)
+            set_stamp(message.header, stamp_ms * 1_000_000)
             bag.write(topic, message, record_ms * 1_000_000)
     return path
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.make_bag import Recording, main, make_bag
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE
@@ -121,7 +122,7 @@ def test_a_bag_reads_back_with_its_truth(tmp_path):
     assert truth.lens == written.lens
     assert truth.scope == written.scope
     stamps = {
-        topic: [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for b, m in messages if b.topic == topic]
+        topic: [stamp_ns(m.header) for b, m in messages if b.topic == topic]
         for topic in (IMAGE, CAMERA_INFO, BODY_POSE, LENS_POSE_TRUE)
     }
     assert len(stamps[IMAGE]) == 6

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from travelling_scope import TINY, travelling
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.acceptance import RULES, Facts, Kept, Reason, judge
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.multi_view.views import bearing_covariances
 
 FRAME_NS = 16_666_667

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseRefusal
+from knee_gap_uncertainty.inputs.pose_buffer import PoseRefusal
 from knee_gap_uncertainty.two_view.gap_range import gap_range
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.joint_motion.joint_motion import (
     FEWEST_CONTRADICTIONS,
     LARGEST_SHIFT,

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.errors import BadInputError
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_core.values.poses import LensPose
+from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer, PoseRefusal
 
 PERIOD_NS = 8_333_333
 START_NS = 1_700_000_000_000_000_000

@@ -9,9 +9,9 @@ from travelling_scope import NOTHING, camera_errors, estimates, reported, scope,
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
 from knee_gap_uncertainty.multi_view.views import bearing_covariances
 from knee_gap_uncertainty.scope_calibration.scope_calibration import (

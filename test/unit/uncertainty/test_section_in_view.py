@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.instrument_gap.gap_profile import gap_profile
 from knee_gap_uncertainty.instrument_gap.instrument_gap import Edges, opening_of
 from knee_gap_uncertainty.instrument_gap.section_edges import NOT_FINITE, NOT_YET, UNSEEN, SectionInView

@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
 from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances

@@ -12,13 +12,62 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.pose_continuity import PoseContinuity
-from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.poses import BodyPose, LensPose
 
 POSES = 3  # through which the motion is drawn
 KEPT = 512  # poses: half a second of the fastest tracker, longer than an image is on its way
 LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion, and beyond the last
 ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
 ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
+
+
+Pose = BodyPose | LensPose
+
+
+def place_between(before: Pose, after: Pose, share: float) -> tuple[Array, Array]:
+    """Position (3,) [m] and quaternion x, y, z, w (4,) at a share of the way from one pose to another.
+
+    Positions linearly, rotations by slerp.
+    """
+    start, end = Rotation.from_quat(before.quaternion_xyzw), Rotation.from_quat(after.quaternion_xyzw)
+    turn = (end * start.inv()).as_rotvec()
+    position: Array = (1.0 - share) * before.position + share * after.position
+    return position, np.asarray((Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True))
+
+
+def body_between(before: BodyPose, after: BodyPose, stamp_ns: int) -> BodyPose:
+    """Pose of a body at a stamp [ns] between two poses."""
+    share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+    position, quaternion = place_between(before, after, share)
+    return BodyPose(stamp_ns, position, quaternion, name=before.name)
+
+
+def lens_between(
+    before: LensPose,
+    after: LensPose,
+    stamp_ns: int,
+    acceleration: float = ACCELERATION,
+    angular_acceleration: float = ANGULAR_ACCELERATION,
+) -> LensPose:
+    """Pose of the lens at a stamp [ns] between two poses; all that is not interpolated is that of `after`.
+
+    Its covariance is not averaged down, as errors of neighbours may be common, and includes what an
+    acceleration [m/s^2] and angular acceleration [rad/s^2], RMS lengths, bend in between.
+    """
+    since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9
+    share = since / (since + until)
+    position, quaternion = place_between(before, after, share)
+    covariance: Array = (1.0 - share) * before.covariance + share * after.covariance
+    # A constant acceleration a bends the path by a s u / 2, s after one and u before the other pose.
+    bend = since * until / 2.0
+    accelerations = np.repeat([acceleration, angular_acceleration], 3)
+    return replace(
+        after,
+        stamp_ns=stamp_ns,
+        position=position,
+        quaternion_xyzw=quaternion,
+        covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
+    )
 
 
 class LensPosePredictor:

@@ -1,7 +1,7 @@
 """Poses as values: a body that the tracker follows, and the lens that is fixed to it."""
 
-from dataclasses import dataclass
-from math import nan
+from dataclasses import dataclass, field
+from math import inf, nan
 
 import numpy as np
 import numpy.typing as npt
@@ -40,18 +40,22 @@ class LensPose:
     `position` (3,) [m] and `quaternion_xyzw` (4,) map coordinates of `child_frame_id` (z along the view, x to
     the right, y down) to `frame_id`. `covariance` (6, 6) is that of position [m^2] and of a small rotation
     [rad^2] about the fixed axes of `frame_id`, in the order x, y, z, rotation about x, y, z (REP-103).
-    `scope_rotation` [rad] is how far the scope is turned in its camera head since its calibration. `segment`
-    counts the breaks in the poses before it, where somebody follows them: see `pose_continuity`.
+    `motion` (6,) is the velocity [m/s] and the angular velocity about the same axes [rad/s], measured over
+    `motion_time` [s]; NaN if not known. `scope_rotation` [rad] is how far the scope is turned in its camera
+    head since its calibration. `segment` counts the breaks in the poses before it, if they are checked: poses
+    of one segment are continuous (`pose_continuity`).
     """
 
     stamp_ns: int
     frame_id: str
-    child_frame_id: str
     position: Array
     quaternion_xyzw: Array
     covariance: Array
+    motion: Array = field(default_factory=lambda: np.full(6, nan))
+    motion_time: float = inf
     scope_rotation: float = 0.0
     segment: int = 0
+    child_frame_id: str = ""
 
     def matrix(self) -> Array:
         """Return the pose as `T_world_lens` (4, 4), which maps lens coordinates to `frame_id`."""
@@ -77,9 +81,3 @@ def is_unit(quaternion: Array) -> bool:
 def is_place(position: Array) -> bool:
     """Whether a position (3,) [m] is finite, and not farther than any tracker sees."""
     return bool(np.abs(position).max() <= FARTHEST)
-
-
-def cross_matrix(vector: Array) -> Array:
-    """Matrix (3, 3) whose product with v is the cross product of `vector` and v."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -15,8 +15,9 @@ from knee_gap_core.bag.bag import BagMessage, BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import rigid
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages import image_from_compressed, image_from_message, stamp_ns
+from knee_gap_perception.messages import image_from_compressed, image_from_message
 
 _LOG = logging.getLogger(__name__)
 STEP_TOPIC = "/knee_gap/calibration_step"

@@ -15,12 +15,8 @@ from knee_gap_core.node.arguments import Parser, finite
 from knee_gap_perception.calibrate.measurements.boards import BOARD_SYNTAX, board_from_text
 from knee_gap_perception.calibrate.procedure import Procedure
 from knee_gap_perception.calibrate.recording import Recording, Request
-from knee_gap_perception.calibration.calibration_file import (
-    Calibration,
-    load_calibration,
-    require_place,
-    save_calibration,
-)
+from knee_gap_perception.calibration.calibration import Calibration
+from knee_gap_perception.calibration.calibration_file import load_calibration, require_place, save_calibration
 from knee_gap_perception.camera.medium import AIR, CHOICES, Medium, medium_of
 from knee_gap_perception.camera.projection import NAMES, LensModel
 from knee_gap_perception.errors import PerceptionError

@@ -17,7 +17,7 @@ from knee_gap_perception.calibrate.solvers.hand_eye import HandEye, HandEyeSetti
 from knee_gap_perception.calibrate.solvers.intrinsics import IntrinsicsFit, fit_intrinsics
 from knee_gap_perception.calibrate.solvers.pivot import calibrate_pivot
 from knee_gap_perception.calibrate.solvers.time_offset import estimate_time_offset
-from knee_gap_perception.calibration.calibration_file import Calibration, Clock, LensOnBody, Oblique, Tip
+from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody, Oblique, Tip
 from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_rotation.notch import NOTCH_SIGMA, common_shape

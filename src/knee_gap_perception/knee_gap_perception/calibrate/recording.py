@@ -12,7 +12,7 @@ from knee_gap_perception.calibrate.bag_input import LONGEST_BAG, CalibrationBag,
 from knee_gap_perception.calibrate.measurements.boards import Board
 from knee_gap_perception.calibrate.measurements.pose_track import PoseTrack
 from knee_gap_perception.calibrate.observations import Observations, observe, still_stamps
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.calibration.calibration_rules import MOST_CLOCK_OFFSET
 from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError

@@ -1,15 +1,11 @@
 """What the numbers of a calibration must obey: a file may carry the right hash over numbers that are none."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_perception.calibration.calibration import Calibration, LensOnBody, Oblique
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.camera.models import MODELS
-
-if TYPE_CHECKING:
-    from knee_gap_perception.calibration.calibration_file import Calibration, LensOnBody, Oblique
 
 # The largest image that is read [px], and the largest offset that calibration looks for [s].
 MOST_PX = 16_384

@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 
 from knee_gap_core.user_files import FileError, expanded
-from knee_gap_perception.calibration.calibration_file import Calibration, load_calibration
+from knee_gap_perception.calibration.calibration import Calibration
+from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.camera.medium import CHOICES, Medium, medium_of
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters

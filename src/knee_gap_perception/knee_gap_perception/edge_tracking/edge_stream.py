@@ -15,7 +15,8 @@ import numpy as np
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.pose_interpolation import LensPosePredictor
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_core.values.stamps import stamp_ns
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.agreement import disagreement
 from knee_gap_perception.camera.bearing_errors import BearingErrors
 from knee_gap_perception.camera.camera_errors import CameraErrors, ErrorSource
@@ -31,7 +32,6 @@ from knee_gap_perception.messages import (
     image_from_message,
     lens_pose_from_message,
     refuse_stamp,
-    stamp_ns,
 )
 from knee_gap_perception.scope_rotation.notch_tracker import NotchFollower, NotchObservation
 

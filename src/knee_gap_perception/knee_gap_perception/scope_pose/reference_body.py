@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.poses import BodyPose, LensPose, cross_matrix
+from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_core.values.rigid_transforms import skew
 
 
 def relative_to(lens: LensPose, reference: BodyPose, covariance: Array) -> LensPose:
@@ -21,7 +22,7 @@ def relative_to(lens: LensPose, reference: BodyPose, covariance: Array) -> LensP
     lever = lens.position - reference.position
     to_reference = np.kron(np.eye(2), R_reference_world.as_matrix())
     by_reference = -np.eye(6)
-    by_reference[:3, 3:] = cross_matrix(lever)
+    by_reference[:3, 3:] = skew(lever)
     by_reference = to_reference @ by_reference
     turned = R_reference_world * Rotation.from_quat(lens.quaternion_xyzw)
     return replace(

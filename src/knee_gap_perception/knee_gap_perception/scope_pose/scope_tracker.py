@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.poses import BodyPose, LensPose, cross_matrix, rigid_transform
-from knee_gap_perception.calibration.calibration_file import Calibration
+from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
+from knee_gap_core.values.rigid_transforms import skew
+from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
 from knee_gap_perception.scope_pose.pose_validity import (
@@ -300,7 +301,7 @@ class ScopeTracker:
         if self.parameters.translation_error_at == "lens":
             return covariance
         J = np.eye(6)
-        J[:3, 3:] = -cross_matrix(lever)
+        J[:3, 3:] = -skew(lever)
         return np.asarray(J @ covariance @ J.T)
 
     def _axis_covariance(self, turn: float) -> Array:

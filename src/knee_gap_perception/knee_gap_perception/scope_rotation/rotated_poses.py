@@ -7,14 +7,9 @@ and the turn in that image itself: nothing is foretold, and an image without its
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.pose_interpolation import ACCELERATION, ANGULAR_ACCELERATION
+from knee_gap_core.values.pose_interpolation import lens_between
 from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
 
@@ -102,25 +97,4 @@ class RotatedPoses:
         poses = [
             self._lens_of(tracked, observation.angle, observation.angle_error) for tracked in (before, after)
         ]
-        return between(poses[0], poses[1], stamp_ns)
-
-
-def between(before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
-    """The pose at a stamp [ns] between two poses; positions linearly, rotations by slerp.
-
-    Its covariance is not averaged down, as errors of neighbours may be common, and holds what a hand's
-    acceleration bends.
-    """
-    since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9
-    share = since / (since + until)
-    start, end = Rotation.from_quat(before.quaternion_xyzw), Rotation.from_quat(after.quaternion_xyzw)
-    turn = (end * start.inv()).as_rotvec()
-    mean: Array = (1.0 - share) * before.covariance + share * after.covariance
-    bent = np.repeat([ACCELERATION, ANGULAR_ACCELERATION], 3) * since * until / 2.0
-    return replace(
-        after,
-        stamp_ns=stamp_ns,
-        position=(1.0 - share) * before.position + share * after.position,
-        quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
-        covariance=np.asarray(mean + np.diag(bent**2 / 3.0)),
-    )
+        return lens_between(poses[0], poses[1], stamp_ns)

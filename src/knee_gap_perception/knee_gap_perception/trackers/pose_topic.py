@@ -8,9 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
-
+from knee_gap_core.values.pose_interpolation import body_between
 from knee_gap_core.values.poses import BodyPose, is_place, is_unit
 from knee_gap_perception.messages_tracking import body_pose_from_message
 from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
@@ -93,11 +91,4 @@ class PoseTopics:
 def _between(before: BodyPose, after: BodyPose, stamp_ns: int) -> BodyPose | None:
     if not all(is_place(body.position) and is_unit(body.quaternion_xyzw) for body in (before, after)):
         return None
-    quaternions = np.array([before.quaternion_xyzw, after.quaternion_xyzw])
-    share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-    return BodyPose(
-        stamp_ns=stamp_ns,
-        position=(1.0 - share) * before.position + share * after.position,
-        quaternion_xyzw=Slerp([0.0, 1.0], Rotation.from_quat(quaternions))(share).as_quat(),
-        name=before.name,
-    )
+    return body_between(before, after, stamp_ns)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from knee_gap_core.values.poses import BodyPose
+from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 
@@ -29,13 +30,13 @@ class RigidBodiesTopic:
     def put(self, message: Any) -> None:
         """Take a message."""
         self._count += 1
-        stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
-        bodies = tuple(self._body(item, stamp_ns) for item in message.rigidbodies)
+        stamp = stamp_ns(message.header)
+        bodies = tuple(self._body(item, stamp) for item in message.rigidbodies)
         known = set(self._names.values())
         for body in bodies:
             if body.name not in known:
                 self._names[self._number(body.name)] = body.name
-        self._frames.append(BodyFrame(stamp_ns, bodies, dict(self._names)))
+        self._frames.append(BodyFrame(stamp, bodies, dict(self._names)))
 
     def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
         """Return the frames since the last call; never waits itself."""

@@ -15,6 +15,7 @@ import numpy as np
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_simulation.calibration.scene import Board, BoardCamera, ChessBoard, DotBoard, RotatedScope
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.recording import (
@@ -316,7 +317,7 @@ def _images(
         stamp_ns = _stamp_ns(time + recording.video_delay)
         record_ns = stamp_ns + IMAGE_LATENCY_NS
         message = blank("sensor_msgs/msg/CompressedImage")
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        set_stamp(message.header, stamp_ns)
         message.header.frame_id = OPTICAL_FRAME
         message.format = "bgr8; jpeg compressed bgr8"
         message.data = np.frombuffer(jpeg(camera.frame(T_board_lens, turn), recording.quality), np.uint8)

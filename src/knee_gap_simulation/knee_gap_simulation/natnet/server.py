@@ -16,12 +16,12 @@ from typing import Self
 
 import numpy as np
 
+from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.natnet import packets
 from knee_gap_simulation.natnet.scene import TrackedScene
 
 HOST = "127.0.0.1"
-NANOSECONDS = 1_000_000_000
 CLIENT_SILENCE_NS = 10 * NANOSECONDS
 
 

@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_simulation.rigid import inverse, quaternion_xyzw
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.clocks import stamp_ns
@@ -125,5 +126,5 @@ def write_parameters(path: Path, scope: Scope, media: Media) -> None:
 
 
 def _stamp(message: Any, stamp_ns: int, frame_id: str) -> None:
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    set_stamp(message.header, stamp_ns)
     message.header.frame_id = frame_id

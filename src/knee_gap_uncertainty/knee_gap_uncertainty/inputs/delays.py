@@ -2,7 +2,8 @@
 
 from collections import deque
 
-NANOSECONDS = 1_000_000_000
+from knee_gap_core.values.stamps import NANOSECONDS
+
 # Of a replay, whose stamps may fall behind the clock slowly: a quarter of a second of a tracker.
 POSES_OF_REPLAY = 32
 # Over so many seconds the least delay is what a message needs: a node that was stopped, or a machine that is

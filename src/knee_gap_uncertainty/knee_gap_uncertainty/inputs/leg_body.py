@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose, PoseBuffer, PoseRefusal
+from knee_gap_core.values.poses import LensPose
+from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer, PoseRefusal
 
 # How many times `max_pose_age` the body's pose may be from the image: it is not interpolated.
 AGES = 2.0

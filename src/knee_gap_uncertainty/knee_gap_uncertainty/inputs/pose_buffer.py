@@ -2,7 +2,7 @@
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from enum import StrEnum
 from math import isfinite
 
@@ -12,34 +12,14 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_core.values.pose_continuity import PoseContinuity
+from knee_gap_core.values.pose_interpolation import lens_between
+from knee_gap_core.values.poses import LensPose
 
 # Over which the velocity is taken [ns]. The tracker's noise on it falls with this time, but the older it is,
 # the more a hand's has changed: 0.0367 mm over 17 ms are 3 mm/s, as are 0.5 m/s^2 in 6 ms.
 MOTION_TIME_NS = 20_000_000
 # A tracker that measures does not give the same numbers to the last bit so often in a row.
 FROZEN_REPEATS = 10
-
-
-@dataclass(frozen=True, eq=False)
-class LensPose:
-    """Pose of the lens at a stamp, with its error: the fields of geometry_msgs/PoseWithCovarianceStamped.
-
-    `position` (3,) [m] and `quaternion_xyzw` (4,) map lens coordinates to `frame_id`; `covariance` (6, 6) is
-    in the order x, y, z [m^2], rotation about the fixed axes x, y, z of `frame_id` [rad^2] (REP-103).
-    `motion` (6,) is the velocity [m/s] and the turning about the same axes [rad/s], NaN where not known, as
-    measured over `motion_time` [s]. `scope_rotation` [rad] is how far the scope was turned in its camera
-    head. Poses of the same `segment` are continuous: no step lies between them, and no place that nobody saw.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    position: Array
-    quaternion_xyzw: Array
-    covariance: Array
-    motion: Array = field(default_factory=lambda: np.full(6, np.nan))
-    motion_time: float = np.inf
-    scope_rotation: float = 0.0
-    segment: int = 0
 
 
 class PoseRefusal(StrEnum):
@@ -155,7 +135,7 @@ class PoseBuffer:
         if before.segment != after.segment:
             return PoseRefusal.DISCONTINUOUS
         earlier = self._before(index)
-        between = self._between(before, after, stamp_ns)
+        between = lens_between(before, after, stamp_ns, self._acceleration, self._angular_acceleration)
         return replace(between, motion=_motion(earlier, after), motion_time=_seconds(earlier, after))
 
     def _before(self, index: int) -> LensPose:
@@ -184,25 +164,6 @@ class PoseBuffer:
             if abs(other.stamp_ns - pose.stamp_ns) <= longest_ns and other.segment == pose.segment
         )
         return next(near, pose)
-
-    def _between(self, before: LensPose, after: LensPose, stamp_ns: int) -> LensPose:
-        since, until = (stamp_ns - before.stamp_ns) / 1e9, (after.stamp_ns - stamp_ns) / 1e9
-        share = since / (since + until)
-        start, end = Rotation.from_quat(before.quaternion_xyzw), Rotation.from_quat(after.quaternion_xyzw)
-        turn = (end * start.inv()).as_rotvec()
-        # The errors of neighbouring poses may be common, so they are not averaged down.
-        covariance: Array = (1.0 - share) * before.covariance + share * after.covariance
-        # A constant acceleration a bends the path by a s u / 2, s after one and u before the other pose.
-        bend = since * until / 2.0
-        accelerations = np.repeat([self._acceleration, self._angular_acceleration], 3)
-        return LensPose(
-            stamp_ns=stamp_ns,
-            frame_id=after.frame_id,
-            position=(1.0 - share) * before.position + share * after.position,
-            quaternion_xyzw=(Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True),
-            covariance=np.asarray(covariance + np.diag((accelerations * bend) ** 2 / 3.0)),
-            segment=after.segment,
-        )
 
 
 def _motion(one: LensPose, other: LensPose) -> Array:

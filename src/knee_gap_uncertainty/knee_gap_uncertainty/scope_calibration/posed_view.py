@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.gap_estimate import EdgeObservation
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.multi_view.views import Views
 
 Floats = npt.NDArray[np.float64]

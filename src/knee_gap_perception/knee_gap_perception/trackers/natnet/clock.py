@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-NANOSECONDS = 1_000_000_000
+from knee_gap_core.values.stamps import NANOSECONDS
 
 # Two crystals differ by no more than this share; over the time after which the rate is fitted [ns], 0.6 ms.
 MAX_DRIFT = 2e-4

@@ -9,10 +9,11 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 from knee_gap_core.values.poses import BodyPose
+from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
 from knee_gap_perception.trackers.natnet import packets
 from knee_gap_perception.trackers.natnet.buffer import PacketError
-from knee_gap_perception.trackers.natnet.clock import NANOSECONDS, OTHER_CLOCK_NS, EchoClock
+from knee_gap_perception.trackers.natnet.clock import OTHER_CLOCK_NS, EchoClock
 from knee_gap_perception.trackers.natnet.packets import MessageId
 from knee_gap_perception.trackers.natnet.words import no_answer, no_data, nothing_usable
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up

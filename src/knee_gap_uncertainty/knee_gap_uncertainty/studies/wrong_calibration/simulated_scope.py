@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.inputs.pose_buffer import LensPose
 from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
 from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
