@@ -61,9 +61,8 @@ def draw(axes: Axes) -> None:
     axes.add_patch(Polygon(corners, facecolor=GREEN, alpha=0.25, edgecolor=GREEN))
     at = (centre + 7.6) * along
     axes.annotate("", at + low * normal, at + high * normal, arrowprops={"arrowstyle": "<->", "color": GREEN})
-    axes.text(
-        *(at + 0.5 * (low + high) * normal + [0.3, 0.0]), "gap", color=GREEN, weight="bold", va="center"
-    )
+    x, y = at + 0.5 * (low + high) * normal
+    axes.text(x + 0.3, y, "gap", color=GREEN, weight="bold", va="center")
     back_along = np.radians(-21.0)
     turn = np.array([[np.cos(back_along), -np.sin(back_along)], [np.sin(back_along), np.cos(back_along)]])
     face_point = RIM - 0.9 * np.array([np.cos(SLOPE), np.sin(SLOPE)])
