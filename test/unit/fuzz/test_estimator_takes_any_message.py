@@ -42,6 +42,18 @@ def edges(draw: Any, stamp_ns: int) -> Any:
         setattr(message, f"hidden_{index}", False)
         setattr(message, f"covariance_{index}", hurt(draw, (1e-7 * planes[index]).ravel(), share=8))
         setattr(message, f"camera_error_{index}", hurt(draw, np.full(27, np.nan), share=8))
+        setattr(message, f"edge_{index}", vector(hurt(draw, bearings[index], share=8)))
+        setattr(message, f"edge_state_{index}", draw(st.sampled_from([1] * 6 + [0, 2, 255])))
+        setattr(message, f"edge_deviation_{index}", float(hurt(draw, [1e-3], share=8)[0]))
+    message.edge_error = float(hurt(draw, [3e-3], share=8)[0])
+    message.sections = [
+        SimpleNamespace(
+            edge_0=vector(hurt(draw, bearings[0], share=8)),
+            edge_1=vector(hurt(draw, bearings[1], share=8)),
+            edge_error=float(hurt(draw, [3e-3], share=8)[0]),
+        )
+        for _ in range(draw(st.integers(0, 2)))
+    ]
     return message
 
 

@@ -24,7 +24,9 @@ from knee_gap_perception.messages_tracking import fill_scope_calibration
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
+from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.messages import calibration_from_message
+from knee_gap_uncertainty.scope_calibration.scope_calibration import shared_error
 
 CAMERA = Intrinsics(
     64, 48, "equidistant", (40.0, 0.0, 32.0, 0.0, 40.0, 24.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0),
@@ -160,11 +162,11 @@ def test_what_is_told_of_it_arrives_in_the_order_of_rep_103() -> None:
     assert reported.hash == SCOPE.hash
     assert reported.time_offset_error == 1e-5
     np.testing.assert_array_equal(np.diag(reported.lens_covariance), [4e-8] * 3 + [1e-8] * 3)
-    assert reported.error is not None
+    assert shared_error([reported], EstimatorParameters()).clock == 1e-5
     message = blank("knee_gap_msgs/msg/ScopeCalibration")
     nothing = calibration_from_message(fill_scope_calibration(message, "tracking_node", None))
     assert nothing.hash == ""
-    assert nothing.error is None
+    assert shared_error([nothing], EstimatorParameters()).clock == EstimatorParameters().clock_error
 
 
 @pytest.mark.parametrize(

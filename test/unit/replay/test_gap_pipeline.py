@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
+from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
@@ -82,6 +82,9 @@ class TrueEdges:
             kinds=(EdgeKind.RIM, EdgeKind.RIM),
             covariances=planes * 1e-6,
             angular_error=3e-3,
+            section=SectionEdges(
+                (EdgeState.SEEN, EdgeState.SEEN), np.zeros((2, 2)), bearings, np.full(2, 1e-4), 3e-4
+            ),
         )
 
 
@@ -139,8 +142,10 @@ def test_the_known_distance_comes_out_once_the_scope_has_moved() -> None:
     assert len(gaps) == len(on(outputs, "/space/gap_edges")) == 180
     valid = [gap for gap in gaps if gap.status == VALID]
     assert len(valid) > 90
-    assert all(gap.gap_min < GAP < gap.gap_max for gap in valid)
-    assert valid[-1].gap == pytest.approx(GAP, rel=0.02)
+    assert all(gap.point_distance_min < GAP < gap.point_distance_max for gap in valid)
+    assert valid[-1].point_distance == pytest.approx(GAP, rel=0.02)
+    # The two points stand for rims, and an instrument may come along the line across them.
+    assert valid[-1].gap == pytest.approx(GAP, rel=0.03)
     assert gaps[1].status == INSUFFICIENT_PARALLAX
 
 

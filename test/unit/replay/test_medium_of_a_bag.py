@@ -33,8 +33,8 @@ def measured(bag: Path, out: Path, old: str = "", new: str = "") -> Comparison:
 
 
 def bias(found: Comparison) -> float:
-    """Median error of the valid estimates, relative to the truth [-]."""
-    return float(np.median((found.gap / found.truth - 1.0)[found.valid]))
+    """Median error of the points' distance in valid estimates, relative to the truth [-]."""
+    return float(np.median((found.point_distance / found.point_truth - 1.0)[found.valid]))
 
 
 def test_the_conversion_takes_the_bias_and_its_bounds_hold(wet: Path, tmp_path: Path) -> None:

@@ -1,0 +1,221 @@
+"""Whether an instrument that does not fit is ever passed: knees whose true gap is known, without pictures.
+
+Each run is a knee, a hand's travel, and what the nodes would be given of it: bearings of two true points of
+the anatomy and of the true edges, wrong by errors drawn from their covariances, and lens poses with a
+tracker's noise. The estimator's answers go to the example leg controller, whose instrument is 0.05 mm
+thicker than the smallest true gap of the run. Printed: runs in which it was passed, the shares of VALID
+estimates whose bounds and interval hold the truth, the median error, and the widths beside those of the
+distance of the two points.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from knee_gap_bringup.leg_control import Action, Estimate, LegControl, LegParameters
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.gap_estimate import (
+    EdgeObservation,
+    EdgeSection,
+    EdgeState,
+    GapEstimate,
+    GapStatus,
+)
+from knee_gap_core.values.poses import LensPose
+from knee_gap_simulation.errors import SimulationError
+from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.recordings.section_truth import edges_at_section, true_instrument_gap
+from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
+
+INSET = np.radians(2.0)
+POINT_ERROR, EDGE_ERROR = np.radians(0.05), np.radians(0.15)  # standard deviations of directions
+POSITION_ERROR, ROTATION_ERROR = 0.0367e-3 / np.sqrt(3.0), np.radians(0.004) / np.sqrt(3.0)
+TOO_THICK = 0.05e-3
+KIND_RIM, KIND_CONTOUR = 1, 2
+
+
+@dataclass
+class Scores:
+    """What the runs add up to; lengths [m]."""
+
+    runs: int = 0
+    passed: int = 0
+    refused: int = 0
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    def line(self) -> str:
+        """All of it in one line."""
+        if not self.rows:
+            return f"{self.runs} runs, no valid estimate"
+        gap, lower, upper, low, high, truth, points = np.array(self.rows).T
+        return (
+            f"{self.runs} runs ({self.refused} that do not fit into the joint left out), {len(gap)} valid  "
+            f"passed an instrument {1e3 * TOO_THICK:.2f} mm too thick in {self.passed}  "
+            f"gap_min <= truth {100 * np.mean(lower <= truth):.2f} %  truth <= gap_max "
+            f"{100 * np.mean(truth <= upper):.2f} %  in the 95 % interval "
+            f"{100 * np.mean((low <= truth) & (truth <= high)):.1f} %  |gap - truth| "
+            f"{1e3 * np.median(np.abs(gap - truth)):.3f} mm (bias {1e3 * np.median(gap - truth):+.3f})  "
+            f"[min, max] {1e3 * np.median(upper - lower):.2f} mm "
+            f"wide, of the points {1e3 * np.median(points):.2f} mm"
+        )
+
+
+class Run:
+    """One knee, seen along a hand's travel."""
+
+    def __init__(self, level: int, seed: int, direction: str, fps: float) -> None:
+        self._simulator = KneeSimulator(level, seed, direction, duration_s=3.0, fps=fps)
+        self._rng = np.random.default_rng([seed, 0x5041])
+        self._times = np.arange(0.3, 3.0, 1.0 / fps)
+        scene = self._simulator.scene
+        self._middle = scene.ridge(0.0)[0] - (0.0, 0.5 * (self._simulator.settings.gap or 0.0), 0.0)
+        first = self._simulator.pose(float(self._times[0]))
+        self._points = self._inset_points(first, self._edges(first))
+
+    def views(self) -> Iterator[tuple[EdgeObservation, LensPose, float]]:
+        """Observation, tracked lens pose and true gap [m] of each image."""
+        for time in self._times:
+            T_scene_lens = self._simulator.pose(float(time))
+            edges = self._edges(T_scene_lens)
+            if not np.isfinite(edges).all():
+                continue
+            truth = true_instrument_gap(self._simulator.scene, T_scene_lens, edges).diameter
+            stamp_ns = round(1e9 * (1.0 + time))
+            yield self._observation(stamp_ns, T_scene_lens, edges), self._pose(stamp_ns, T_scene_lens), truth
+
+    def _edges(self, T_scene_lens: Array) -> Array:
+        """True bearings (2, 3) of the edges through the middle of the gap, the condyle's first."""
+        lens, scene = self._simulator.lens, self._simulator.scene
+        pixel = lens.pixels(T_scene_lens[:3, :3].T @ (self._middle - T_scene_lens[:3, 3]))
+        return edges_at_section(scene, lens, T_scene_lens, pixel)
+
+    def _inset_points(self, T_scene_lens: Array, edges: Array) -> Array:
+        """Surface points (2, 3) beside the edges, in the scene."""
+        view, across = edges.sum(axis=0), edges[1] - edges[0]
+        view, across = view / np.linalg.norm(view), across / np.linalg.norm(across)
+        half = 0.5 * float(np.arccos(np.clip(edges[0] @ edges[1], -1.0, 1.0)))
+        angles = np.array([-half - INSET, half + INSET])[:, None]
+        points = self._simulator.scene.surface_points(
+            T_scene_lens, np.cos(angles) * view + np.sin(angles) * across
+        )
+        if not np.isfinite(points).all():
+            raise SimulationError("the section has no tissue beside its edges")
+        return np.asarray(points)
+
+    def _observation(self, stamp_ns: int, T_scene_lens: Array, edges: Array) -> EdgeObservation:
+        seen = (self._points - T_scene_lens[:3, 3]) @ T_scene_lens[:3, :3]
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        bearings = self._wrong(seen, POINT_ERROR)
+        # The edge is wrong across the opening, which is where it is looked for.
+        axis = np.cross(edges[0], edges[1])
+        axis /= np.linalg.norm(axis)
+        turned = [
+            Rotation.from_rotvec(EDGE_ERROR * self._rng.standard_normal() * axis).apply(edge)
+            for edge in edges
+        ]
+        outer = bearings[..., :, None] * bearings[..., None, :]
+        return EdgeObservation(
+            stamp_ns,
+            1,
+            True,
+            bearings,
+            POINT_ERROR**2 * (np.eye(3) - outer),
+            angular_error=3.0 * POINT_ERROR,
+            kinds=(KIND_CONTOUR, KIND_RIM),
+            section=EdgeSection(
+                (EdgeState.SEEN, EdgeState.SEEN), np.array(turned), np.full(2, EDGE_ERROR), 3.0 * EDGE_ERROR
+            ),
+        )
+
+    def _wrong(self, directions: Array, deviation: float) -> Array:
+        moved = directions + deviation * self._rng.standard_normal(directions.shape)
+        return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
+
+    def _pose(self, stamp_ns: int, T_scene_lens: Array) -> LensPose:
+        turn = Rotation.from_rotvec(ROTATION_ERROR * self._rng.standard_normal(3))
+        rotation = Rotation.from_matrix(T_scene_lens[:3, :3]) * turn
+        return LensPose(
+            stamp_ns=stamp_ns,
+            frame_id="world",
+            position=T_scene_lens[:3, 3] + POSITION_ERROR * self._rng.standard_normal(3),
+            quaternion_xyzw=rotation.as_quat(),
+            covariance=np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3),
+        )
+
+
+def is_passed(estimates: Sequence[GapEstimate], diameter: float) -> bool:
+    """Whether the example controller passes an instrument of a diameter [m] on any of the estimates."""
+    control = LegControl(LegParameters(instrument_diameter=diameter, largest_gap=diameter + 0.01))
+    for estimate in estimates:
+        heard = Estimate(
+            is_valid=estimate.status is GapStatus.VALID,
+            track_id=estimate.track_id,
+            age=0.02,
+            gap=estimate.gap,
+            gap_min=estimate.gap_min,
+            gap_max=estimate.gap_max,
+            stamp_ns=estimate.stamp_ns,
+        )
+        if control.on_estimate(heard, 1e-9 * estimate.stamp_ns).action is Action.PASS:
+            return True
+    return False
+
+
+def score(run: Run, scores: Scores) -> None:
+    """Add a run."""
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE))
+    truths: dict[int, float] = {}
+    estimates: list[GapEstimate] = []
+    for edges, pose, truth in run.views():
+        truths[edges.stamp_ns] = truth
+        estimates += estimator.add_pose(pose, pose.stamp_ns)
+        estimates += estimator.add_edges(edges, edges.stamp_ns)
+    scores.runs += 1
+    if not truths:
+        return
+    scores.passed += is_passed(estimates, min(truths.values()) + TOO_THICK)
+    for one in estimates:
+        if one.status is GapStatus.VALID:
+            scores.rows.append(
+                (
+                    one.gap,
+                    one.gap_min,
+                    one.gap_max,
+                    one.confidence_min,
+                    one.confidence_max,
+                    truths[one.stamp_ns],
+                    one.point_distance_max - one.point_distance_min,
+                )
+            )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Score the levels, directions and runs asked for."""
+    parser = argparse.ArgumentParser(prog="bench_passing", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=88000, help="of the first run")
+    parser.add_argument("--level", type=int, nargs="+", default=[1])
+    parser.add_argument("--travel-direction", nargs="+", default=["along"])
+    parser.add_argument("--fps", type=float, default=10.0)
+    asked = parser.parse_args(argv)
+    for direction in asked.travel_direction:
+        for level in asked.level:
+            scores = Scores()
+            seeds = range(asked.seed, asked.seed + asked.runs)
+            for seed in tqdm(seeds, desc=f"level {level} {direction}", disable=not sys.stderr.isatty()):
+                try:
+                    score(Run(level, seed, direction, asked.fps), scores)
+                except SimulationError:
+                    scores.refused += 1
+            print(f"level {level} {direction:8s} {scores.line()}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
