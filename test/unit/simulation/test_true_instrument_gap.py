@@ -441,6 +441,9 @@ def test_no_edges_are_made_up(sections: dict[str, Section]) -> None:
         section.truth.instrument_gap(section.T_world_lens, np.full((2, 3), np.nan))
     with pytest.raises(SimulationError):
         section.truth.instrument_gap(section.T_world_lens, np.stack([section.edges[0]] * 2))
+    middle, across = section.edges.mean(axis=0), section.edges[1] - section.edges[0]
+    with pytest.raises(SimulationError, match="off all tissue"):
+        section.truth.instrument_gap(section.T_world_lens, middle + np.outer([-0.1, 0.1], across))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -476,3 +479,37 @@ def test_what_else_is_true_of_a_section(sections: dict[str, Section]) -> None:
     assert truth.across_view < truth.edge_distance
     assert isinstance(section.scene, KneeScene)
     assert truth.nearest_distance >= section.scene.nearest_distance()[0] - 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_truth_follows_the_edges_without_jumps(sections: dict[str, Section], name: str) -> None:
+    """Edges up to 0.7 degrees inside the opening or in the tissue keep their sides; the truth is smooth."""
+    section = sections[name]
+    across = (section.edges[1] - section.edges[0]) / np.linalg.norm(section.edges[1] - section.edges[0])
+    gaps = []
+    for inward in np.radians(np.arange(-0.7, 0.71, 0.1)):
+        edges = section.edges + inward * np.stack([across, -across])
+        points = edge_contacts(section.scene, section.T_scene_lens, edges)
+        assert points[0, 1] < 0.0 < points[1, 1]
+        gaps.append(true_instrument_gap(section.scene, section.T_scene_lens, edges).diameter)
+    assert np.abs(np.diff(gaps)).max() < 30 * MICROMETRE
+    assert np.ptp(gaps) < 150 * MICROMETRE
+
+
+@pytest.mark.parametrize("yaw", [-40.0, -25.0, 25.0, 40.0])
+def test_an_oblique_line_of_sight_touches_what_it_passes(yaw: float) -> None:
+    """Rims far to the side, some of them behind the lens, are not what a line of sight comes closest to."""
+    scene = RimScene.random(0.004, 7)
+    T_scene_lens = transform([0.0, np.radians(yaw), 0.0], [-np.radians(yaw) * 9e-3, 0.3e-3, -9e-3])
+    lens = T_scene_lens[:3, 3]
+    upper, lower = scene.rim(0.2e-3)
+    for inward in (0.0, 0.008):
+        away = np.concatenate([upper, lower]) - lens
+        bearings = away / np.linalg.norm(away, axis=1)[:, None] @ T_scene_lens[:3, :3]
+        across = (bearings[1] - bearings[0]) / np.linalg.norm(bearings[1] - bearings[0])
+        bearings = bearings + inward * np.stack([across, -across])
+        for order in ([0, 1], [1, 0]):
+            points = edge_contacts(scene, T_scene_lens, bearings[order])[order]
+            assert np.linalg.norm(points - np.concatenate([upper, lower]), axis=1).max() < (
+                2 * MICROMETRE if inward == 0.0 else 0.4e-3
+            )

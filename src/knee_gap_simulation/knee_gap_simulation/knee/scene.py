@@ -17,7 +17,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.surfaces import distance_field as fields
 from knee_gap_simulation.surfaces.distance_field import CAPSULE, CONDYLE, MENISCUS, PLATEAU, PROBE
-from knee_gap_simulation.surfaces.tissue_samples import TissueSamples, knee_samples
+from knee_gap_simulation.surfaces.tissue_samples import TissueSamples, angles_off, knee_samples
 
 KIND = "knee"
 NO_PROBE = np.zeros((0, 4))
@@ -233,17 +233,17 @@ class KneeScene:
         """Points on condyle, plateau, meniscus and capsule within ``reach`` [m] of a centre (3,)."""
         return knee_samples(self.constants(), self.wave_array(), centre, reach)
 
-    def contact(self, origin: Array, direction: Array) -> Array:
-        """Point (3,) that a line of sight along an edge of the gap touches: of the rim or of the condyle.
+    def contacts(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Points (2, 3) of the condyle and of the rim of the meniscus to which a line of sight comes closest.
 
-        Where the line misses or cuts the tissue, the point of that side's surface where it comes closest.
+        A line that cuts the condyle comes closest where it is deepest. The angles (2,) [rad] between the line
+        and the points follow.
         """
         along = np.linspace(-_EDGE_WITHIN, _EDGE_WITHIN, 2001)
-        off = _angles_off(origin, direction, self.ridge(along))
-        index = int(np.argmin(off))
+        index = int(np.argmin(angles_off(origin, direction, self.ridge(along))))
         step = float(along[1] - along[0])
         place = minimize_scalar(
-            lambda x: _angles_off(origin, direction, self.ridge(float(x)))[0],
+            lambda x: angles_off(origin, direction, self.ridge(float(x)))[0],
             bounds=(along[index] - step, along[index] + step),
             method="bounded",
             options={"xatol": 1e-9},
@@ -257,11 +257,10 @@ class KneeScene:
             method="bounded",
             options={"xatol": 1e-9},
         )
-        if abs(nearest.fun) / nearest.x < place.fun:
-            foot = np.empty(3)
-            fields.foot_on_condyle(origin + nearest.x * direction, self.constants(), self.wave_array(), foot)
-            return foot
-        return np.asarray(self.ridge(float(place.x))[0])
+        foot = np.empty(3)
+        fields.foot_on_condyle(origin + nearest.x * direction, self.constants(), self.wave_array(), foot)
+        points = np.stack([foot, self.ridge(float(place.x))[0]])
+        return points, angles_off(origin, direction, points)
 
     def nearest_distance(self) -> tuple[float, Array, Array]:
         """Smallest distance between the condyle and the tissue below it, and the points (3,) where it is.
@@ -302,13 +301,6 @@ class KneeScene:
             x, y, z = scene.condyle_centre
             scene = replace(scene, condyle_centre=(x, y - excess, z))
         return scene
-
-
-def _angles_off(origin: Array, direction: Array, points: Array) -> Array:
-    """Angles (n,) [rad] between a line of sight and points (n, 3)."""
-    away = points - origin
-    along = away @ direction
-    return np.asarray(np.arctan2(np.linalg.norm(away - along[:, None] * direction, axis=1), along))
 
 
 def _waves(rng: np.random.Generator, roughness: float) -> tuple[Wave, ...]:

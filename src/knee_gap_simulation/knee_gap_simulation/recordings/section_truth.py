@@ -20,6 +20,9 @@ Scene = RimScene | KneeScene
 # How far from the plane of the section [m] tissue counts for the nearest distance of the two sides there.
 NEAR_SECTION = 0.5e-3
 
+# Edges [rad] that are nearer to each other bound nothing; lines of sight farther off all tissue are no edges.
+_LEAST_APART = float(np.radians(0.5))
+_MOST_MISSED = float(np.radians(8.0))
 _GRID = 0.004  # [m]: sections whose middles lie in one cell of it share their samples of the tissue
 # How wide [m] a section may be, and how far [m] around the middle of its cell the tissue is then sampled.
 _REACHES = ((0.012, 0.018), (0.020, 0.028))
@@ -53,12 +56,28 @@ class SectionTruth(NamedTuple):
 
 
 def edge_contacts(scene: Scene, T_scene_lens: Array, edge_bearings: npt.ArrayLike) -> Array:
-    """The points (2, 3) of the scene that the lines of sight along two edges (2, 3) of a lens touch."""
+    """The points (2, 3) of the two sides that the lines of sight along two edges (2, 3) of a lens touch.
+
+    A line that misses or cuts its side is taken to the point of the side to which it comes closest, so that
+    the points follow the bearings without jumps.
+    """
     bearings = np.asarray(edge_bearings, dtype=np.float64).reshape(2, 3)
     if not np.isfinite(bearings).all() or not (np.linalg.norm(bearings, axis=1) > 0.0).all():
         raise SimulationError(f"the bearings of the edges must be finite vectors, not {bearings.tolist()}")
     directions = bearings / np.linalg.norm(bearings, axis=1)[:, None] @ T_scene_lens[:3, :3].T
-    return np.stack([scene.contact(T_scene_lens[:3, 3], direction) for direction in directions])
+    apart = float(np.arctan2(np.linalg.norm(np.cross(*directions)), directions[0] @ directions[1]))
+    if apart < _LEAST_APART:
+        raise SimulationError(f"the edges lie {np.degrees(apart):.2f} degrees apart: they bound no opening")
+    (points_0, off_0), (points_1, off_1) = (
+        scene.contacts(T_scene_lens[:3, 3], direction) for direction in directions
+    )
+    # One edge on each side, in the order that moves the lines of sight least: also where they miss narrowly.
+    straight = bool(off_0[0] + off_1[1] <= off_0[1] + off_1[0])
+    first, second = (0, 1) if straight else (1, 0)
+    missed = max(float(off_0[first]), float(off_1[second]))
+    if missed > _MOST_MISSED:
+        raise SimulationError(f"an edge lies {np.degrees(missed):.1f} degrees off all tissue: it is none")
+    return np.stack([points_0[first], points_1[second]])
 
 
 def view_between(T_scene_lens: Array, edge_bearings: npt.ArrayLike) -> Array:

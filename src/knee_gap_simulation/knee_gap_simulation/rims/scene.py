@@ -23,6 +23,7 @@ from knee_gap_simulation.surfaces.tissue_samples import (
     SPACING,
     UPPER_SIDE,
     TissueSamples,
+    angles_off,
     joined,
     steps,
 )
@@ -141,20 +142,22 @@ class RimScene:
             parts.append((UPPER_SIDE if side == UPPER else LOWER_SIDE, leaf))
         return joined(parts, centre, reach)
 
-    def contact(self, origin: Array, direction: Array) -> Array:
-        """Point (3,) of a rim that a line of sight touches: where it comes closest to one."""
-        begin, end = -_EDGE_WITHIN, _EDGE_WITHIN
-        for _ in range(4):
-            along = np.linspace(begin, end, 601)
-            found = []
-            for rim in self.rim(along):
-                away = rim - origin
-                far = away @ direction
-                off = np.linalg.norm(away - far[:, None] * direction, axis=1) / far
-                found.append((float(off.min()), int(off.argmin()), rim[off.argmin()]))
-            _, index, point = min(found, key=lambda pair: pair[0])
-            begin, end = along[max(0, index - 2)], along[min(len(along) - 1, index + 2)]
-        return np.asarray(point)
+    def contacts(self, origin: Array, direction: Array) -> tuple[Array, Array]:
+        """Points (2, 3) of the upper and the lower rim to which a line of sight comes closest, as an angle.
+
+        The angles (2,) [rad] between the line and the points follow.
+        """
+        points, angles = np.empty((2, 3)), np.empty(2)
+        for side in (UPPER, LOWER):
+            begin, end = -_EDGE_WITHIN, _EDGE_WITHIN
+            for _ in range(4):
+                along = np.linspace(begin, end, 601)
+                rim = self.rim(along)[side]
+                off = angles_off(origin, direction, rim)
+                index = int(off.argmin())
+                begin, end = along[max(0, index - 2)], along[min(len(along) - 1, index + 2)]
+            points[side], angles[side] = rim[index], off[index]
+        return points, angles
 
     def looks_into_gap(self, T_scene_lens: Array, bearings: Array) -> npt.NDArray[np.bool_]:
         """Whether bearings (n, 3) of a lens look into the gap."""

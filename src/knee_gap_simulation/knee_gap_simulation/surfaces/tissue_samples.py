@@ -44,6 +44,13 @@ def joined(parts: list[tuple[int, Array]], centre: Array, reach: float) -> Tissu
     return TissueSamples(np.ascontiguousarray(points[kept]), sides[kept])
 
 
+def angles_off(origin: Array, direction: Array, points: Array) -> Array:
+    """Angles (n,) [rad] between a line of sight and points (n, 3); beyond a right angle for those behind."""
+    away = points - origin
+    along = away @ direction
+    return np.asarray(np.arctan2(np.linalg.norm(away - along[:, None] * direction, axis=1), along))
+
+
 def steps(low: float, high: float, spacing: float) -> Array:
     """Places from low to high, both included, at most ``spacing`` apart; none if high is below low."""
     if not high >= low:
