@@ -128,6 +128,7 @@ class Track:
         if finding is not Finding.STILL:
             return self._contradicted(blank, finding)
         self._passing = None if self._window.add(view.view) else view.view
+        blank = replace(blank, view_count=len(self._window))
         if fitted is None:
             return self._refused(blank, Facts(self._parameters, error=no_fit))
         parameters = self._parameters
@@ -274,7 +275,7 @@ class Track:
         section_flaw = section if isinstance(section, str) else ""
         if not isinstance(section, str):
             opening = opening_of(view.bearings, section.bearings)
-            section_flaw = flaw_of(opening)
+            section_flaw = flaw_of(opening, np.linalg.norm(fitted.points - view.lens, axis=1))
             if not section_flaw:
                 measured = self._with_gap(measured, observation, view, fitted, opening, section)
         facts = Facts(

@@ -76,15 +76,16 @@ class TrueEdges:
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         nothing = GapEdges.without_points(stamp, "arthroscope_optical", EdgeStatus.VALID, track_id=1)
         planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
+        seen = (EdgeState.SEEN, EdgeState.SEEN)
+        section = SectionEdges(seen, np.zeros((2, 2)), bearings, np.full(2, 1e-4), 3e-4)
         return replace(
             nothing,
             bearings=bearings,
             kinds=(EdgeKind.RIM, EdgeKind.RIM),
             covariances=planes * 1e-6,
             angular_error=3e-3,
-            section=SectionEdges(
-                (EdgeState.SEEN, EdgeState.SEEN), np.zeros((2, 2)), bearings, np.full(2, 1e-4), 3e-4
-            ),
+            section=section,
+            sections=(section,),
         )
 
 
@@ -162,7 +163,9 @@ def test_images_stamped_since_boot_are_out_of_sync_as_live(tmp_path: Path, image
             bag.add_topic(topic, msgtype, "sensor")
         for index in range(240):
             stamp_ns = epoch_ns + index * POSE_PERIOD_NS
-            bag.write("/body", body(stamp_ns), stamp_ns + 3_000_000)
+            tracked = body(index * POSE_PERIOD_NS)
+            set_stamp(tracked.header, stamp_ns)
+            bag.write("/body", tracked, stamp_ns + 3_000_000)
             if index % 2 == 0:
                 image_ns = stamp_ns + 1_000_000
                 for topic, msgtype in (("/camera_info", "CameraInfo"), ("/image", "CompressedImage")):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.user_files import FileError
 from knee_gap_simulation.contact_sheet import contact_sheet, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Difficulty, conditions
@@ -175,5 +176,5 @@ def test_a_contact_sheet_takes_real_frames(tmp_path):
     noise = np.random.default_rng(1).integers(0, 255, (90, 160, 3), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), noise)
     assert contact_sheet([], read_frames(tmp_path)).shape == (2 * 34 + 400, 1600, 3)
-    with pytest.raises(SimulationError, match="no picture"):
+    with pytest.raises(FileError, match="No such file"):
         read_frames(tmp_path / "b.png")

@@ -257,9 +257,19 @@ def test_the_edge_of_a_cylinder_lies_about_where_its_tangent_touches():
 
 def test_edges_that_cross_and_points_inside_the_opening_are_refused():
     scene = some_cylinders(np.random.default_rng(2))
-    points = bearings(scene.points)
-    assert flaw_of(opening_of(points, scene.edges)) == ""
-    assert "inside" in flaw_of(opening_of(points, scene.edges[::-1]))
+    points, ranges = bearings(scene.points), np.linalg.norm(scene.points, axis=1)
+    assert flaw_of(opening_of(points, scene.edges), ranges) == ""
+    assert "inside" in flaw_of(opening_of(points, scene.edges[::-1]), ranges)
     inside = 0.5 * scene.edges + 0.5 * scene.edges[::-1]
-    assert "inside" in flaw_of(opening_of(bearings(inside + 0.2 * (scene.edges - inside)), scene.edges))
-    assert "opening" in flaw_of(opening_of(points, np.stack([scene.edges[0], scene.edges[0]])))
+    between = bearings(inside + 0.2 * (scene.edges - inside))
+    assert "inside" in flaw_of(opening_of(between, scene.edges), ranges)
+    one = np.stack([scene.edges[0], scene.edges[0]])
+    assert "opening" in flaw_of(opening_of(points, one), ranges)
+
+
+def test_points_that_are_not_beside_their_edges_are_refused():
+    scene = some_cylinders(np.random.default_rng(2))
+    opening, ranges = opening_of(bearings(scene.points), scene.edges), np.linalg.norm(scene.points, axis=1)
+    assert "far from its edge" in flaw_of(opening._replace(insets=np.array([0.03, 0.3])), ranges)
+    assert "different distances" in flaw_of(opening, ranges * [1.0, 4.0])
+    assert flaw_of(opening, np.array([np.nan, 0.01])) == ""

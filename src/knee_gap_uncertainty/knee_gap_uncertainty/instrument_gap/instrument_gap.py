@@ -41,7 +41,7 @@ KIND_RIM, KIND_CONTOUR = 1, 2
 SHAPES = {KIND_RIM: RIM_SHAPES, KIND_CONTOUR: CONTOUR_SHAPES}
 
 # How far [m] a real surface departs from these shapes: ripples, frayed rims, a point beside the section.
-ROUGHNESS = 0.05e-3
+ROUGHNESS = 0.08e-3
 ROUGHNESS_BOUND = 0.12e-3
 
 # Places on the confidence ellipse of the two inverse distances at which its extremes are looked for.
@@ -49,6 +49,10 @@ AROUND = 64
 
 # Angle [rad] by which a tracked point may lie inside the opening before edges and points contradict.
 MOST_INSIDE = 0.01
+# Angle [rad] by which a point may lie beyond its edge, and ratio of the points' distances. Beyond them it
+# is not on the tissue that ends at its edge, but on something before or behind it.
+MOST_INSET = 0.2
+MOST_RATIO = 2.5
 LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad]
 
 # Points outside the opening have a positive angle on both sides.
@@ -122,12 +126,16 @@ def opening_of(points: Array, edges: Array) -> Opening:
     return Opening(half, np.arctan2(aside, forward) - half, np.hypot(forward, aside), view, across)
 
 
-def flaw_of(opening: Opening) -> str:
-    """Why edges cannot be used with their points, in words; empty if they can."""
+def flaw_of(opening: Opening, ranges: Array) -> str:
+    """Why edges cannot be used with points at distances (2,) [m], in words; empty if they can."""
     if not LEAST_HALF < opening.half < MOST_HALF:
         return "the edges do not enclose an opening"
     if not (opening.insets > -MOST_INSIDE).all():
         return "a tracked point lies inside the opening"
+    if not (opening.insets < MOST_INSET).all():
+        return "a tracked point lies too far from its edge"
+    if np.isfinite(ranges).all() and not ranges.max() < MOST_RATIO * ranges.min():
+        return "the two sides of the opening lie at too different distances"
     return ""
 
 
