@@ -14,7 +14,7 @@ from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
+from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer
 
 POINTS = np.array([[2e-3, -2e-3, 12e-3], [1e-3, 2.1e-3, 11e-3]])
@@ -91,7 +91,7 @@ def take(estimator: GapEstimator, draw: Any, stamp_ns: int, now_ns: int) -> list
 @pytest.fixture(scope="module")
 def moved() -> GapEstimator:
     """An estimator that has followed the two points over 4 mm, so that it has a track and a valid gap."""
-    estimator = GapEstimator()
+    estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE))
     for k in range(30):
         stamp = BEGIN_NS - (31 - k) * 16_666_667
         lens = np.array([4e-3 * k / 30, 0.0, 0.0])
@@ -111,7 +111,7 @@ def moved() -> GapEstimator:
                 angular_error=3e-3,
                 status=1,
                 frame_id="arthroscope_optical",
-            ),
+            ).with_rims_at_points(),
             stamp,
         )
     assert estimator.counts["VALID"] > 0
