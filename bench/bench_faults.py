@@ -38,6 +38,7 @@ from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
 )
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
+from knee_gap_simulation.rigid import from_parts
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 
@@ -82,6 +83,14 @@ class Recording:
         places = np.array([[p.position.x, p.position.y, p.position.z] for p in poses.values()])
         farthest = places[np.argmax(np.linalg.norm(places - places[0], axis=1))] - places[0]
         return cls(stamped, scene, poses, farthest / np.linalg.norm(farthest))
+
+    def truth(self, stamp: int, edges: Any) -> float:
+        """True instrument gap [m] of the section that a GapEdges of an image's stamp [ns] shows."""
+        # A fault of the image clock shifts the stamps; what the image shows, it shows of its own time.
+        pose = self.poses.get(stamp) or self.poses[min(self.poses, key=lambda known: abs(known - stamp))]
+        p, q = pose.position, pose.orientation
+        rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        return true_gap(self.scene, from_parts(rotation, [p.x, p.y, p.z]), edges)
 
     def with_fault(self, fault: Fault) -> Iterator[tuple[str, Any, int]]:
         """The messages with a fault, in the order of the stamps that they have then."""
@@ -199,10 +208,10 @@ class Recorder:
 
 @dataclass
 class Outcome:
-    """What the estimator was called with under a fault, and the true value of every track [m]."""
+    """What the estimator was called with under a fault, and the edges of each image by its stamp [ns]."""
 
     calls: list[tuple[str, tuple[Any, ...]]]
-    truths: dict[int, float]
+    edges: dict[int, Any]
 
 
 def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcome:
@@ -211,20 +220,17 @@ def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcom
     pipeline = GapPipeline.from_parameters(file, topics, SPACE)
     recorder = Recorder(file.build("uncertainty_node", [EstimatorParameters])[0])
     pipeline._estimator = recorder  # type: ignore[assignment]
-    truths: dict[int, float] = {}
+    edges: dict[int, Any] = {}
     for topic, message, stamp in recording.with_fault(fault):
-        _note_truths(recording, pipeline.feed(topic, message, stamp), truths)
-    _note_truths(recording, pipeline.finish(), truths)
-    return Outcome(recorder.calls, truths)
+        _note_edges(pipeline.feed(topic, message, stamp), edges)
+    _note_edges(pipeline.finish(), edges)
+    return Outcome(recorder.calls, edges)
 
 
-def _note_truths(recording: Recording, outputs: Any, truths: dict[int, float]) -> None:
+def _note_edges(outputs: Any, edges: dict[int, Any]) -> None:
     for output in outputs:
-        if output.topic != f"{SPACE}/gap_edges":
-            continue
-        edges = output.message
-        if edges.track_id and edges.track_id not in truths and output.stamp_ns in recording.poses:
-            truths[edges.track_id] = true_gap(recording.scene, recording.poses[output.stamp_ns], edges)
+        if output.topic == f"{SPACE}/gap_edges":
+            edges[output.stamp_ns] = output.message
 
 
 def estimated(outcome: Outcome, file: ParametersFile) -> tuple[list[GapEstimate], Counter[str]]:
@@ -250,10 +256,10 @@ class Row(NamedTuple):
     error: float
 
     @classmethod
-    def of(cls, found: Sequence[GapEstimate], truths: dict[int, float]) -> "Row":
-        """Count estimates beside the truth."""
+    def of(cls, found: Sequence[GapEstimate], recording: Recording, edges: dict[int, Any]) -> "Row":
+        """Count estimates beside the true instrument gap of the section that their image shows."""
         valid = [one for one in found if one.status is GapStatus.VALID]
-        truth = np.array([truths[one.track_id] for one in valid])
+        truth = np.array([recording.truth(one.stamp_ns, edges[one.stamp_ns]) for one in valid])
 
         def values(name: str) -> Array:
             return np.array([getattr(one, name) for one in valid])
@@ -299,7 +305,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 continue
             outcome = _kept(asked.keep, f"{bag.name} {name}", lambda f=fault: measured(recording, f, file))  # type: ignore[misc] # noqa: B023
             found, counts = estimated(outcome, file)
-            row = Row.of(found, outcome.truths)
+            row = Row.of(found, recording, outcome.edges)
             print(row.line(name), flush=True)
             if asked.reasons:
                 print(f"    {dict(counts)}")
