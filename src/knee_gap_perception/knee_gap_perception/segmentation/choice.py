@@ -10,7 +10,7 @@ from knee_gap_perception.segmentation.thresholds import Adaptive, Otsu, Otsu3
 
 
 class Strategy(NamedTuple):
-    """How a segmentation is made from the settings of its class; `needs_network`: from a file of a network."""
+    """How a segmentation is made from its settings; `needs_network`: from a file of a network."""
 
     make: Callable[..., Segmentation]
     needs_network: bool = False
