@@ -30,11 +30,11 @@ from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_perception.camera.models import Camera, FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
+from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator, SimulatorFrame
 from knee_gap_simulation.scope.hand_motion import TravelDirection
 
-STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese")
 NEEDED = (0.97, 0.96, 0.94, 0.88)
 BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
 GOLDEN = 0.618034  # [-] the multiples of which spread evenly
@@ -56,7 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--level", type=int, nargs="+", default=[0, 1, 2, 3])
     parser.add_argument("--travel-direction", nargs="+", default=["along"])
     parser.add_argument("--frames", type=int, default=3, help="of every seed, over its travel")
-    parser.add_argument("--strategy", nargs="+", choices=STRATEGIES, default=["otsu", "otsu3", "watershed"])
+    parser.add_argument(
+        "--strategy", nargs="+", choices=WITHOUT_NETWORK, default=["otsu", "otsu3", "watershed"]
+    )
     parser.add_argument("--full-size", action="store_true", help="the first strategy at full size as well")
     parser.add_argument("--no-gap", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--real", type=Path, nargs="*", default=[], help="real frames: folders or videos")

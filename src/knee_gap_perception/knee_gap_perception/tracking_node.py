@@ -5,8 +5,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 
+from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.message_types import message_class
 from knee_gap_core.node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.node.seam import Fault
@@ -22,15 +24,14 @@ from knee_gap_perception.messages_tracking import (
 )
 from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.trackers.body_source import Subscription
 from knee_gap_perception.trackers.natnet.client import NatNetParameters
-from knee_gap_perception.trackers.pose_topic import PoseTopics
-from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
-from knee_gap_perception.trackers.scope_feed import SCOPE, ScopeFeed, SourceParameters
+from knee_gap_perception.trackers.scope_feed import ScopeFeed, SourceParameters
 
 # After so many diagnostics, one a second, a source that still gives nothing is told in the log as well.
 DIAGNOSTICS_TO_LOG = 5
-# How long one look at NatNet's socket may wait [s]: as long as the node may take to end.
-NATNET_WAIT = 0.1
+# How long one look at a source that waits may take [s]: as long as the node may take to end.
+SOURCE_WAIT = 0.1
 
 
 class TrackingNode(BaseNode):
@@ -52,10 +53,7 @@ class TrackingNode(BaseNode):
             self._tracker = ScopeTracker(
                 parameters, validity, calibration.load(), by_notch=calibration.scope_rotation_notch
             )
-            others = tuple(
-                name for name in (parameters.reference_body, parameters.scope_rotation_body) if name
-            )
-            self._feed = ScopeFeed(source, natnet, other_bodies=others, ros_now=self.now_ns)
+            self._feed = ScopeFeed(source, natnet, other_bodies=parameters.other_bodies, ros_now=self.now_ns)
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
         if self._tracker.follows_rotation:
@@ -75,11 +73,9 @@ class TrackingNode(BaseNode):
             self.create_subscription(ScopeNotch, "scope_notch", self.on_notch, RESULT_QOS)
         self._ended = threading.Event()
         self._receiver: threading.Thread | None = None
-        if isinstance(self._feed.source, PoseTopics):
-            self.listen_to_poses(self._feed.source, parameters)
-        elif isinstance(self._feed.source, RigidBodiesTopic):
-            self.listen_to_rigid_bodies(self._feed.source)
-        else:
+        for subscription in self._feed.source.subscriptions:
+            self.listen(subscription)
+        if self._feed.source.waits:
             self._receiver = threading.Thread(target=self.receive, daemon=True)
             self._receiver.start()
 
@@ -87,30 +83,17 @@ class TrackingNode(BaseNode):
         """Time of ROS, which NatNet's exposures are mapped to."""
         return int(self.get_clock().now().nanoseconds)
 
-    def listen_to_poses(self, source: PoseTopics, parameters: TrackingParameters) -> None:
-        """Subscribe to the scope's pose, the leg's where one is the reference, a second body of the scope."""
-        topics = {
-            SCOPE: "scope_body/pose",
-            parameters.reference_body: "reference_body/pose",
-            parameters.scope_rotation_body: "scope_rotation_body/pose",
-        }
-        for name, topic in topics.items():
-            if not name:
-                continue
-            self.create_subscription(
-                PoseStamped, topic, partial(self.on_message, partial(source.put, name)), TRACKER_QOS
-            )
-
-    def listen_to_rigid_bodies(self, source: RigidBodiesTopic) -> None:
-        """Subscribe to all bodies at once. Raises ConfigurationError where the messages are not installed."""
+    def listen(self, subscription: Subscription) -> None:
+        """Subscribe to a topic of the source. Raises ConfigurationError if its messages are not installed."""
         try:
-            from mocap4r2_msgs.msg import RigidBodies  # an optional package, needed by this source only
-        except ImportError as error:
+            kind = message_class(subscription.msgtype)
+        except BagError as error:
+            package = subscription.msgtype.partition("/")[0]
             raise ConfigurationError(
-                "source rigid_bodies needs the package mocap4r2_msgs, which is not installed"
+                f"source {self._feed.parameters.source} needs the package {package}, which is not installed"
             ) from error
         self.create_subscription(
-            RigidBodies, "rigid_bodies", partial(self.on_message, source.put), TRACKER_QOS
+            kind, subscription.topic, partial(self.on_message, subscription.put), TRACKER_QOS
         )
 
     def on_message(self, put: Any, message: Any) -> None:
@@ -119,14 +102,14 @@ class TrackingNode(BaseNode):
         self.publish_polled(0.0)
 
     def receive(self) -> None:
-        """Publish what Motive sends, until the node ends; in a thread of its own, because it waits."""
-        poll = self.guarded("frame of NatNet", partial(self.publish_polled, NATNET_WAIT))
+        """Publish what the source receives, until the node ends; in a thread of its own, because it waits."""
+        poll = self.guarded("frame of the tracker", partial(self.publish_polled, SOURCE_WAIT))
         while not self._ended.is_set():
             faults = self.seam.counts.total()
             poll()
             if self.seam.counts.total() > faults:
                 # What raises at once whenever it is looked at must not take the whole processor.
-                self._ended.wait(NATNET_WAIT)
+                self._ended.wait(SOURCE_WAIT)
 
     def publish_polled(self, timeout: float) -> None:
         """Publish the lens pose of each new frame, or log why there is none."""

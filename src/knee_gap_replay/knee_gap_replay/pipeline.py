@@ -132,12 +132,8 @@ class GapPipeline:
         self._tracker = tracker
         # A bag holds topics; what came straight from Motive was recorded as the pose of the lens.
         self._body_names = {topics.body_pose: SCOPE}
-        for topic, name in (
-            ("reference_body/pose", tracker.parameters.reference_body),
-            ("scope_rotation_body/pose", tracker.parameters.scope_rotation_body),
-        ):
-            if name:
-                self._body_names[f"{space}/{topic}"] = name
+        for name, topic in tracker.parameters.other_bodies.items():
+            self._body_names[f"{space}/{topic}"] = name
         self._bodies = PoseTopics([*self._body_names.values()], up_axis=up_axis)
         self._estimator = estimator
         self._topics = topics

@@ -48,7 +48,7 @@ class PlayNode(GuardedNode):
     def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:
         with refused_by_ros():
             super().__init__("play")
-        refuse_unknown(self, self._parameter_overrides)
+        refuse_unknown(self)
         self._publishers_by_topic: dict[str, Publisher] = {}
         for name in sorted(topics):
             try:

@@ -41,7 +41,7 @@ class RecordNode(GuardedNode):
     def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
         with refused_by_ros():
             super().__init__("record")
-        refuse_unknown(self, self._parameter_overrides)
+        refuse_unknown(self)
         self._writer = writer
         self._wanted = [self._resolved(topic) for topic in dict.fromkeys(topics)]
         self._refused: set[str] = set()

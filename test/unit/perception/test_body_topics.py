@@ -9,7 +9,7 @@ from knee_gap_perception.trackers.body_source import UnknownBodyError, choose_bo
 from knee_gap_perception.trackers.natnet.client import NatNetParameters
 from knee_gap_perception.trackers.pose_topic import PoseTopics
 from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
-from knee_gap_perception.trackers.scope_feed import ScopeFeed, SourceParameters
+from knee_gap_perception.trackers.scope_feed import SOURCES, ScopeFeed, SourceParameters
 
 MILLISECOND = 1_000_000
 
@@ -155,9 +155,11 @@ class TestRigidBodies:
 
 class TestScopeFeed:
     def test_pose_topics_with_a_leg(self):
-        feed = ScopeFeed(SourceParameters(), other_bodies=("tibia",))
-        for name in ("scope", "tibia"):
-            feed.source.put(name, stamped(5 * MILLISECOND))
+        feed = ScopeFeed(SourceParameters(), other_bodies={"tibia": "reference_body/pose"})
+        topics = {one.topic: one.put for one in feed.source.subscriptions}
+        assert list(topics) == ["scope_body/pose", "reference_body/pose"]
+        for put in topics.values():
+            put(stamped(5 * MILLISECOND))
         ((body, others),) = feed.poll()
         assert body.name == "scope"
         assert [other.name for other in others] == ["tibia"]
@@ -175,6 +177,14 @@ class TestScopeFeed:
         status = wrong.status()
         assert not status.ok
         assert "no rigid body 'skope'; it has: 'scope' (id 1), 'tibia' (id 2)" in status.words
+
+    @pytest.mark.parametrize("source", SOURCES)
+    def test_every_source_waits_by_itself_or_has_topics(self, source):
+        feed = ScopeFeed(SourceParameters(source=source), NatNetParameters(command_port=9))
+        assert feed.source.waits != bool(feed.source.subscriptions)
+        for subscription in feed.source.subscriptions:
+            assert subscription.msgtype.count("/") == 2
+        feed.close()
 
     def test_natnet_waits_for_its_server(self):
         parameters = NatNetParameters(command_port=9)

@@ -10,7 +10,7 @@ import pytest
 
 from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
+from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK, segmentation_named
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.three_classes import otsu3
 from knee_gap_perception.segmentation.thresholds import otsu_threshold
@@ -30,7 +30,7 @@ def drawn() -> tuple[Image, Mask, Mask]:
     return np.clip(image, 0, 255).astype(np.uint8), field, gap
 
 
-@pytest.mark.parametrize("name", [name for name in STRATEGIES if name != "onnx"])
+@pytest.mark.parametrize("name", WITHOUT_NETWORK)
 def test_strategies_find_the_gap(name: str, drawn: tuple[Image, Mask, Mask]) -> None:
     image, field, gap = drawn
     dark = segmentation_named(name)(image, field)
@@ -40,13 +40,13 @@ def test_strategies_find_the_gap(name: str, drawn: tuple[Image, Mask, Mask]) -> 
     assert (segmentation_named(name)(image, field) == dark).all()
 
 
-@pytest.mark.parametrize("name", [name for name in STRATEGIES if name != "onnx"])
+@pytest.mark.parametrize("name", WITHOUT_NETWORK)
 def test_an_empty_field_has_no_gap(name: str, drawn: tuple[Image, Mask, Mask]) -> None:
     image, field, _ = drawn
     assert not segmentation_named(name)(image, np.zeros_like(field)).any()
 
 
-@pytest.mark.parametrize("name", [name for name in STRATEGIES if name != "onnx"])
+@pytest.mark.parametrize("name", WITHOUT_NETWORK)
 @pytest.mark.parametrize("level", [0, 130, 255])
 def test_an_even_picture_does_no_harm(name: str, level: int, drawn: tuple[Image, Mask, Mask]) -> None:
     _, field, _ = drawn

@@ -1,5 +1,7 @@
 """The window of views: bounded, spread, and unmoved by a lens that stands still."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -7,7 +9,12 @@ import pytest
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.keyframe_window import ViewWindow
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
-from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
+from knee_gap_uncertainty.multi_view.views import (
+    Views,
+    bearing_covariances,
+    isotropic_covariances,
+    joined,
+)
 
 Floats = npt.NDArray[np.float64]
 
@@ -112,3 +119,26 @@ def test_an_empty_window_and_two_views_at_once_are_refused() -> None:
         window.add(one.joined(one))
     with pytest.raises(BadInputError, match="at least 2 views, not 1"):
         ViewWindow(1)
+
+
+def one_view() -> Views:
+    return view_at(np.zeros(3), np.random.default_rng(2))
+
+
+def test_what_one_part_does_not_know_is_unknown_of_all() -> None:
+    known, unknown = one_view(), replace(one_view(), times=None)
+    known = replace(known, times=np.array([3.0]), motion_times=np.array([0.02]))
+    unknown = replace(unknown, motion_times=np.array([0.03]))
+    both = joined([known, unknown], 0.25)
+    assert both.times is None
+    np.testing.assert_array_equal(both.motion_times, [0.02, 0.03])
+    assert len(both) == 2
+    assert both.common_share == 0.25
+
+
+def test_errors_of_different_cameras_are_not_put_together() -> None:
+    one, other = (replace(one_view(), camera_errors=np.zeros((1, 2, 3, k))) for k in (2, 4))
+    assert joined([one, other], 0.5).camera_errors is None
+    assert joined([one, one], 0.5).camera_errors.shape == (2, 2, 3, 2)
+    with pytest.raises(BadInputError):
+        joined([], 0.5)

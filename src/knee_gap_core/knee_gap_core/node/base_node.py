@@ -124,7 +124,7 @@ class BaseNode(GuardedNode):
 
     def refuse_unknown_parameters(self) -> None:
         """Refuse to start with a parameter that no component declared."""
-        refuse_unknown(self, self._parameter_overrides)
+        refuse_unknown(self)
 
     def publish_diagnostics(self) -> None:
         """Publish the node's health now."""

@@ -5,7 +5,7 @@ high) and `choices`. Parameters are read-only: changing a calibration or an erro
 track would make one estimate out of two.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, fields
 from itertools import pairwise
@@ -81,15 +81,18 @@ def declare(node: Any, kind: type[Parameters]) -> Parameters:
         raise ConfigurationError(str(error)) from error
 
 
-def refuse_unknown(node: Any, overrides: Iterable[str]) -> None:
+def refuse_unknown(node: Any) -> None:
     """Refuse parameters that were given and never declared: a misspelt name would silently do nothing.
 
     Raises:
         ConfigurationError: names those parameters and the ones there are.
 
     """
+    # rclpy has no public list of what was given or declared; nothing else of ours reads its private names.
     unknown = sorted(
-        name for name in overrides if not node.has_parameter(name) and not _is_always_allowed(name)
+        name
+        for name in node._parameter_overrides
+        if not node.has_parameter(name) and not _is_always_allowed(name)
     )
     if unknown:
         known = sorted(name for name in node._parameters if not _is_always_allowed(name))

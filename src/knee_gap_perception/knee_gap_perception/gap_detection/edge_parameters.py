@@ -17,7 +17,7 @@ class EdgeParameters:
 
     segmentation: str = field(
         default="watershed",
-        metadata={"description": "How the dark gap is told from tissue", "choices": STRATEGIES},
+        metadata={"description": "How the dark gap is told from tissue", "choices": tuple(STRATEGIES)},
     )
     network_path: str = field(
         default="", metadata={"description": "ONNX file of the segmentation 'onnx': picture in, gap out"}
@@ -133,5 +133,7 @@ class EdgeParameters:
         ):
             if len(getattr(self, name)) != length:
                 raise PerceptionError(f"{name} must have {length} numbers, not {len(getattr(self, name))}")
-        if self.segmentation == "onnx" and not self.network_path:
-            raise PerceptionError("network_path must name an ONNX file for the segmentation 'onnx'")
+        if STRATEGIES[self.segmentation].needs_network and not self.network_path:
+            raise PerceptionError(
+                f"network_path must name an ONNX file for the segmentation '{self.segmentation}'"
+            )

@@ -14,7 +14,7 @@ from knee_gap_perception.gap_detection.cross_section import Section, find_sectio
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 from knee_gap_perception.image.instruments_and_glare import foreign_bodies
-from knee_gap_perception.segmentation.choice import segmentation_named
+from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
@@ -152,7 +152,7 @@ def check_light(values: Image) -> float:
 
 def _settings(parameters: EdgeParameters) -> dict[str, object]:
     """Settings of the segmentation that the parameters name."""
-    if parameters.segmentation != "onnx":
+    if not STRATEGIES[parameters.segmentation].needs_network:
         return {}
     return {
         "path": parameters.network_path,

@@ -128,6 +128,15 @@ class TrackingParameters:
                 f"body_to_shaft_quaternion_xyzw must be of length 1 within 0.001, not {norm:.6g}"
             )
 
+    @property
+    def other_bodies(self) -> dict[str, str]:
+        """Topics of the bodies that are needed beside the scope's, by the names of the bodies."""
+        topics = {
+            self.reference_body: "reference_body/pose",
+            self.scope_rotation_body: "scope_rotation_body/pose",
+        }
+        return {name: topic for name, topic in topics.items() if name}
+
     def body_to_lens(self) -> Array:
         """Return `T_body_lens` (4, 4), which maps lens coordinates to body coordinates."""
         T_body_shaft = rigid_transform(self.body_to_shaft_translation, self.body_to_shaft_quaternion_xyzw)

@@ -1,14 +1,45 @@
-"""A segmentation strategy by its name."""
+"""The segmentation strategies by their names: one table."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.strategy import Segmentation
 from knee_gap_perception.segmentation.thresholds import Adaptive, Otsu, Otsu3
 
-STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese", "onnx")
+
+class Strategy(NamedTuple):
+    """How a segmentation is made from its settings; `needs_network`: from a file of a network."""
+
+    make: Callable[..., Segmentation]
+    needs_network: bool = False
+
+
+def _watershed(**settings: Any) -> Segmentation:
+    # Imported by need, as the library behind it takes a second to load; the next one as well.
+    from knee_gap_perception.segmentation.flooding import Watershed
+
+    return Watershed(**settings)
+
+
+def _chan_vese(**settings: Any) -> Segmentation:
+    from knee_gap_perception.segmentation.active_contour import ChanVese
+
+    return ChanVese(**settings)
+
+
+# A new strategy is a module with a Segmentation, and a row here.
+STRATEGIES: dict[str, Strategy] = {
+    "otsu": Strategy(Otsu),
+    "otsu3": Strategy(Otsu3),
+    "adaptive": Strategy(Adaptive),
+    "watershed": Strategy(_watershed),
+    "chan_vese": Strategy(_chan_vese),
+    "onnx": Strategy(Network, needs_network=True),
+}
+# What works without a file of the user's.
+WITHOUT_NETWORK = tuple(name for name, strategy in STRATEGIES.items() if not strategy.needs_network)
 
 
 def segmentation_named(name: str, **settings: Any) -> Segmentation:
@@ -16,22 +47,6 @@ def segmentation_named(name: str, **settings: Any) -> Segmentation:
 
     Raises PerceptionError for an unknown name and for what the strategy itself refuses.
     """
-    simple: dict[str, Callable[..., Segmentation]] = {
-        "otsu": Otsu,
-        "otsu3": Otsu3,
-        "adaptive": Adaptive,
-    }
-    if name in simple:
-        return simple[name](**settings)
-    # Imported by need: the library behind these takes a second to load.
-    if name == "watershed":
-        from knee_gap_perception.segmentation.flooding import Watershed
-
-        return Watershed(**settings)
-    if name == "chan_vese":
-        from knee_gap_perception.segmentation.active_contour import ChanVese
-
-        return ChanVese(**settings)
-    if name == "onnx":
-        return Network(**settings)
-    raise PerceptionError(f"segmentation must be one of {', '.join(STRATEGIES)}, not '{name}'")
+    if name not in STRATEGIES:
+        raise PerceptionError(f"segmentation must be one of {', '.join(STRATEGIES)}, not '{name}'")
+    return STRATEGIES[name].make(**settings)

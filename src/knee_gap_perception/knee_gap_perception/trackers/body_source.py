@@ -1,8 +1,8 @@
 """What every input of tracked bodies gives: frames of bodies with stamps, and a word on how it fares."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_perception.errors import PerceptionError
@@ -36,8 +36,26 @@ class SourceStatus:
     values: Mapping[str, object] = field(default_factory=dict)
 
 
+class Subscription(NamedTuple):
+    """A topic that a source takes its messages from: its name, its type, and what a message is put into."""
+
+    topic: str
+    msgtype: str
+    put: Callable[[Any], None]
+
+
 class BodySource(Protocol):
-    """Where tracked bodies come from."""
+    """Where tracked bodies come from.
+
+    `waits` is whether `poll` waits for frames, and so needs a thread of its own; other sources have a frame
+    only after a message of one of their `subscriptions`.
+    """
+
+    waits: bool
+
+    @property
+    def subscriptions(self) -> tuple[Subscription, ...]:
+        """Topics to subscribe to; none if the source receives by itself."""
 
     def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
         """Return the frames since the last call, in their order; waits up to `timeout` [s] for one."""

@@ -5,13 +5,14 @@ of exposure: the stamp is what they put there, mostly the time of arrival.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from knee_gap_core.values.pose_interpolation import body_between
 from knee_gap_core.values.poses import BodyPose, is_place, is_unit
 from knee_gap_perception.messages_tracking import body_pose_from_message
-from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
+from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus, Subscription
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 
 MOST_WAITING = 64
@@ -22,12 +23,21 @@ class PoseTopics:
 
     Poses of the other bodies are taken with the very same stamp where there is one, and otherwise between
     their two poses around it, never beyond the last. A scope pose waits for them for at most `max_wait` [s]
-    by the stamps that keep coming, and is then given without. A `BodySource`.
+    by the stamps that keep coming, and is then given without. `topics` are those of the bodies by their
+    names. A `BodySource`.
     """
 
+    waits = False
+
     def __init__(
-        self, names: Sequence[str] = ("scope",), *, up_axis: str = "z", max_wait: float = 0.05
+        self,
+        names: Sequence[str] = ("scope",),
+        *,
+        topics: Mapping[str, str] | None = None,
+        up_axis: str = "z",
+        max_wait: float = 0.05,
     ) -> None:
+        self._topics = dict(topics or {})
         self._names = dict(enumerate(names, start=1))
         self._scope, *self._others = names
         self._up_axis = up_axis
@@ -36,6 +46,14 @@ class PoseTopics:
         self._recent: dict[str, deque[BodyPose]] = {name: deque(maxlen=MOST_WAITING) for name in self._others}
         self._counts = dict.fromkeys(names, 0)
         self._last_counts = dict(self._counts)
+
+    @property
+    def subscriptions(self) -> tuple[Subscription, ...]:
+        """One topic a body."""
+        return tuple(
+            Subscription(topic, "geometry_msgs/msg/PoseStamped", partial(self.put, name))
+            for name, topic in self._topics.items()
+        )
 
     def put(self, name: str, message: Any) -> None:
         """Take a message of the topic of a body."""

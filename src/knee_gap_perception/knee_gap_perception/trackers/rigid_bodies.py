@@ -11,7 +11,7 @@ import numpy as np
 
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_core.values.stamps import stamp_ns
-from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
+from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus, Subscription
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 
 MOST_WAITING = 64
@@ -20,12 +20,19 @@ MOST_WAITING = 64
 class RigidBodiesTopic:
     """Frames of a RigidBodies topic; a `BodySource`. A name that is a number is a streaming id."""
 
+    waits = False
+
     def __init__(self, *, up_axis: str = "z") -> None:
         self._up_axis = up_axis
         self._frames: deque[BodyFrame] = deque(maxlen=MOST_WAITING)
         self._names: dict[int, str] = {}
         self._count = 0
         self._last_count = 0
+
+    @property
+    def subscriptions(self) -> tuple[Subscription, ...]:
+        """One topic with all bodies."""
+        return (Subscription("rigid_bodies", "mocap4r2_msgs/msg/RigidBodies", self.put),)
 
     def put(self, message: Any) -> None:
         """Take a message."""

@@ -1,8 +1,9 @@
 """The tracked scope from whichever source a lab has, and what is wrong when it does not come."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_perception.parameters import check_parameters
@@ -12,9 +13,39 @@ from knee_gap_perception.trackers.pose_topic import PoseTopics
 from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
 from knee_gap_perception.trackers.up_axis import UP_AXES
 
-SOURCES = ("pose", "rigid_bodies", "natnet")
 # Name of the scope's body where each body has its own topic.
 SCOPE = "scope"
+SCOPE_TOPIC = "scope_body/pose"
+
+
+class Setting(NamedTuple):
+    """What a source is made from: topics of the bodies by their names, the scope's first, and the rest."""
+
+    topics: Mapping[str, str]
+    up_axis: str
+    natnet: NatNetParameters | None
+    ros_now: Callable[[], int]
+
+
+class Source(NamedTuple):
+    """A kind of source: how it is made, which axis points up if none is given, and how bodies are named.
+
+    `own_names`: the scope is chosen by the name or id that the tracker gives it, not by its topic.
+    """
+
+    make: Callable[[Setting], BodySource]
+    up_axis: str = "z"
+    own_names: bool = True
+
+
+# A new tracker is a module that makes a BodySource, and a row here.
+SOURCES = {
+    "pose": Source(
+        lambda given: PoseTopics([*given.topics], topics=given.topics, up_axis=given.up_axis), own_names=False
+    ),
+    "rigid_bodies": Source(lambda given: RigidBodiesTopic(up_axis=given.up_axis)),
+    "natnet": Source(lambda given: NatNetClient(given.natnet, given.ros_now, up_axis=given.up_axis), "y"),
+}
 
 
 @dataclass(frozen=True)
@@ -26,7 +57,7 @@ class SourceParameters:
         metadata={
             "description": "pose: geometry_msgs/PoseStamped, a topic a body; rigid_bodies: "
             "mocap4r2_msgs/RigidBodies; natnet: straight from Motive",
-            "choices": SOURCES,
+            "choices": tuple(SOURCES),
         },
     )
     body: str = field(
@@ -50,16 +81,15 @@ class SourceParameters:
 
     def resolved_up_axis(self) -> str:
         """Return the axis that is meant."""
-        if self.up_axis != "auto":
-            return self.up_axis
-        return "y" if self.source == "natnet" else "z"
+        return SOURCES[self.source].up_axis if self.up_axis == "auto" else self.up_axis
 
 
 class ScopeFeed:
     """The scope's body and the others of its frame, from the source that the parameters name.
 
-    Messages of topics are put into `source` by the node; NatNet is received here. Raises PerceptionError for
-    an address that cannot be used.
+    `other_bodies` are the topics of other bodies by their names, for sources with a topic a body. Messages of
+    the source's `subscriptions` are put into it by the node. Raises PerceptionError for an address that
+    cannot be used.
     """
 
     def __init__(
@@ -67,26 +97,20 @@ class ScopeFeed:
         parameters: SourceParameters | None = None,
         natnet: NatNetParameters | None = None,
         *,
-        other_bodies: Sequence[str] = (),
+        other_bodies: Mapping[str, str] | None = None,
         ros_now: Callable[[], int] = time.time_ns,
     ) -> None:
         self.parameters = parameters or SourceParameters()
-        up_axis = self.parameters.resolved_up_axis()
-        self.source: BodySource
-        self._wanted = self.parameters.body
-        if self.parameters.source == "natnet":
-            self.source = NatNetClient(natnet, ros_now, up_axis=up_axis)
-        elif self.parameters.source == "rigid_bodies":
-            self.source = RigidBodiesTopic(up_axis=up_axis)
-        else:
-            self.source = PoseTopics([SCOPE, *other_bodies], up_axis=up_axis)
-            self._wanted = SCOPE
+        kind = SOURCES[self.parameters.source]
+        topics = {SCOPE: SCOPE_TOPIC, **(other_bodies or {})}
+        self.source = kind.make(Setting(topics, self.parameters.resolved_up_axis(), natnet, ros_now))
+        self._wanted = self.parameters.body if kind.own_names else SCOPE
         self._fault = ""
 
     def poll(self, timeout: float = 0.0) -> list[tuple[BodyPose, tuple[BodyPose, ...]]]:
         """Return the scope's body and the others of each new frame in which the scope is told of.
 
-        Only NatNet waits, for at most `timeout` [s].
+        Only a source that `waits` does, for at most `timeout` [s].
         """
         chosen = []
         for frame in self.source.poll(timeout):

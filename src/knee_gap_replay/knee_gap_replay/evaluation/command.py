@@ -21,7 +21,7 @@ from knee_gap_perception.camera.models import Camera, EquiangularCamera, camera_
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.evaluation.difference_picture import difference_picture, panel
 from knee_gap_perception.evaluation.image_error import EdgeError, Overlap, edge_error, overlap, rms
-from knee_gap_perception.segmentation.choice import STRATEGIES
+from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK
 from knee_gap_replay.evaluation.pairs import SHEET_ROWS, BagTopics, Pair, bag_pairs, folder_pairs, is_bag
 
 
@@ -166,7 +166,7 @@ def _parser() -> Parser:
     )
     parser.add_argument(
         "--segmentation",
-        choices=[name for name in STRATEGIES if name != "onnx"],
+        choices=WITHOUT_NETWORK,
         help="segment the bag's images so; without it, if the bag has no masks, as segmentation_node does",
     )
     return parser

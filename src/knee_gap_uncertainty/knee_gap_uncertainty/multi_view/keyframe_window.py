@@ -3,7 +3,7 @@
 import numpy as np
 
 from knee_gap_core.values.errors import BadInputError
-from knee_gap_uncertainty.multi_view.views import Views, all_camera_errors
+from knee_gap_uncertainty.multi_view.views import Views, joined
 
 CAPACITY = 240
 # A view is worth keeping where the lens is this many RMS errors of its position away from all views kept: a
@@ -57,25 +57,7 @@ class ViewWindow:
         """
         if not self._views:
             raise BadInputError("the window is empty: add a view first")
-        rotations = [view.lens_rotations for view in self._views if view.lens_rotations is not None]
-        motions = [view.lens_motions for view in self._views if view.lens_motions is not None]
-        times = [view.motion_times for view in self._views if view.motion_times is not None]
-        turns = [view.scope_rotations for view in self._views if view.scope_rotations is not None]
-        seconds = [view.times for view in self._views if view.times is not None]
-        return Views(
-            lens_positions=np.concatenate([view.lens_positions for view in self._views]),
-            bearings=np.concatenate([view.bearings for view in self._views]),
-            bearing_covariances=np.concatenate([view.bearing_covariances for view in self._views]),
-            lens_covariances=np.concatenate([view.lens_covariances for view in self._views]),
-            rotation_covariances=np.concatenate([view.rotation_covariances for view in self._views]),
-            common_share=common_share,
-            lens_rotations=np.concatenate(rotations) if len(rotations) == len(self._views) else None,
-            lens_motions=np.concatenate(motions) if len(motions) == len(self._views) else None,
-            motion_times=np.concatenate(times) if len(times) == len(self._views) else None,
-            scope_rotations=np.concatenate(turns) if len(turns) == len(self._views) else None,
-            times=np.concatenate(seconds) if len(seconds) == len(self._views) else None,
-            camera_errors=all_camera_errors(self._views),
-        )
+        return joined(self._views, common_share)
 
     def _is_apart(self, view: Views, others: list[Views]) -> bool:
         """Whether the lens is more than the spacing away from all of the others."""

@@ -1,7 +1,7 @@
 """The views of a track: lens positions and bearings in one frame, with their errors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -104,35 +104,7 @@ class Views:
 
     def joined(self, other: "Views") -> "Views":
         """These views and then `other`'s, with the common share of these."""
-        rotations = (self.lens_rotations, other.lens_rotations)
-        motions = (self.lens_motions, other.lens_motions)
-        times = (self.motion_times, other.motion_times)
-        turns = (self.scope_rotations, other.scope_rotations)
-        seconds = (self.times, other.times)
-        return Views(
-            lens_positions=np.concatenate([self.lens_positions, other.lens_positions]),
-            bearings=np.concatenate([self.bearings, other.bearings]),
-            bearing_covariances=np.concatenate([self.bearing_covariances, other.bearing_covariances]),
-            lens_covariances=np.concatenate([self.lens_covariances, other.lens_covariances]),
-            rotation_covariances=np.concatenate([self.rotation_covariances, other.rotation_covariances]),
-            common_share=self.common_share,
-            lens_rotations=None
-            if rotations[0] is None or rotations[1] is None
-            else np.concatenate([rotations[0], rotations[1]]),
-            lens_motions=None
-            if motions[0] is None or motions[1] is None
-            else np.concatenate([motions[0], motions[1]]),
-            motion_times=None
-            if times[0] is None or times[1] is None
-            else np.concatenate([times[0], times[1]]),
-            camera_errors=all_camera_errors([self, other]),
-            scope_rotations=None
-            if turns[0] is None or turns[1] is None
-            else np.concatenate([turns[0], turns[1]]),
-            times=None
-            if seconds[0] is None or seconds[1] is None
-            else np.concatenate([seconds[0], seconds[1]]),
-        )
+        return joined([self, other], self.common_share)
 
     def __len__(self) -> int:
         """Number of views."""
@@ -161,12 +133,26 @@ class Views:
         return np.ascontiguousarray(np.swapaxes(rotations, -1, -2))
 
 
-def all_camera_errors(parts: Sequence[Views]) -> Array | None:
-    """The camera's errors of several views, one after the other; None where they are not of the same."""
-    errors = [part.camera_errors for part in parts if part.camera_errors is not None]
-    if len(errors) < len(parts) or len({one.shape[-1] for one in errors}) != 1:
-        return None
-    return np.concatenate(errors)
+def joined(parts: Sequence[Views], common_share: float) -> Views:
+    """All views of the parts, one after the other; None for what is not known in every part.
+
+    The camera's errors are known if they are those of one camera. Raises BadInputError for no parts.
+    """
+    if not parts:
+        raise BadInputError("there are no views to be joined")
+    arrays: dict[str, Array | None] = {}
+    for field in fields(Views):
+        if field.name == "common_share":
+            continue
+        values = [getattr(part, field.name) for part in parts]
+        known = [value for value in values if value is not None]
+        arrays[field.name] = np.concatenate(known) if len(known) == len(parts) and _alike(known) else None
+    return Views(**arrays, common_share=common_share)  # type: ignore[arg-type]  # None where it may be
+
+
+def _alike(values: Sequence[Array]) -> bool:
+    """Whether arrays differ in the number of views alone."""
+    return len({value.shape[1:] for value in values}) == 1
 
 
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:

@@ -76,6 +76,9 @@ class NatNetClient:
     stream. Raises PerceptionError for an address that is none or that this machine does not have.
     """
 
+    waits = True
+    subscriptions = ()
+
     def __init__(
         self,
         parameters: NatNetParameters | None = None,
