@@ -195,8 +195,9 @@ class Recorder:
     def __init__(self, parameters: EstimatorParameters) -> None:
         self.parameters = parameters
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
-        # Nothing is estimated, and so nothing advised.
+        # Nothing is estimated, and so nothing advised and no profile made.
         self.advice: deque[Any] = deque()
+        self.profiles: deque[Any] = deque()
 
     def __getattr__(self, name: str) -> Callable[..., list[Any]]:
         def call(*arguments: Any) -> list[Any]:

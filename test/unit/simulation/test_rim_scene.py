@@ -164,7 +164,7 @@ def test_a_mistake_gets_one_line_and_leaves_no_bag(tmp_path, capsys, arguments, 
     try:
         code = main([str(tmp_path / "bag"), *arguments])
     except SystemExit as refused:
-        code = refused.code
+        code = int(refused.code or 0)
     assert code != 0
     reported = capsys.readouterr().err.strip()
     assert "\n" not in reported
