@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
-from knee_gap_simulation.rigid import from_parts
 
 Floats = npt.NDArray[np.float64]
 EDGES = "/knee_gap/gap_edges"
@@ -200,4 +200,4 @@ def true_point_distance(scene: SceneTruth, T_world_lens: Array, edges: Any) -> f
 def _matrix(pose: Any) -> Array:
     """A geometry_msgs/Pose as (4, 4)."""
     p, q = pose.position, pose.orientation
-    return from_parts(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z])
+    return rigid(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [p.x, p.y, p.z])

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Conditions, Difficulty, conditions
 from knee_gap_simulation.knee.ground_truth import PointObservations, SurfacePoints, follow, surface_points
@@ -37,7 +38,6 @@ from knee_gap_simulation.knee.knee_camera import KneeCamera, KneeLight
 from knee_gap_simulation.knee.probe import Probe
 from knee_gap_simulation.knee.scene import KneeScene
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_simulation.rigid import from_parts
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.clocks import stamp_ns, tracker_times
 from knee_gap_simulation.scope.hand_motion import Hand, HandMotion, TravelDirection
@@ -272,7 +272,7 @@ class KneeSimulator:
         begin, end = self._body_times[[before, after]]
         share = (time - begin) / (end - begin)
         turn = Slerp([0.0, 1.0], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
-        return from_parts(turn, (1.0 - share) * pair[0, :3, 3] + share * pair[1, :3, 3])
+        return rigid(turn, (1.0 - share) * pair[0, :3, 3] + share * pair[1, :3, 3])
 
     def _shift(self, time: float) -> Array:
         """How far [px] the middle of the picture moves while the shutter is open around a time."""

@@ -16,6 +16,7 @@ from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser, finite
 from knee_gap_core.user_files import flaw_of_new
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.calibration.bag import (
     BOARDS,
     LENSES,
@@ -35,7 +36,6 @@ from knee_gap_simulation.recordings.recording import (
     write_recording,
 )
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_simulation.rigid import inverse
 from knee_gap_simulation.rims.render import ScopeCamera
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.clocks import image_times, stamp_ns, tracker_times

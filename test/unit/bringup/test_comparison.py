@@ -11,12 +11,12 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, rigid
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_simulation.make_bag import Recording, make_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_simulation.rigid import from_parts, inverse, transform
 from knee_gap_uncertainty.messages import fill_gap_estimate
 
 TRACK = 4
@@ -40,7 +40,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneTrut
                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
                 ]
             )
-            poses[stamp_ns(message.header)] = from_parts(turn, [p.x, p.y, p.z])
+            poses[stamp_ns(message.header)] = rigid(turn, [p.x, p.y, p.z])
     return bag, truth, poses
 
 
@@ -154,6 +154,6 @@ def test_a_turned_world_does_not_change_the_truth(recording):
     T_world_lens = poses[min(poses)]
     bearings = truth.edges_at_section(T_world_lens, truth.lens.pixels([0.0, 0.0, 1.0]))
     here = truth.instrument_gap(T_world_lens, bearings).diameter
-    move = transform([0.2, 0.9, -0.4], [1.0, -2.0, 0.5])
+    move = from_rotation_vectors([0.2, 0.9, -0.4], [1.0, -2.0, 0.5])
     moved = replace(truth, T_world_scene=move @ truth.T_world_scene)
     assert moved.instrument_gap(move @ T_world_lens, bearings).diameter == pytest.approx(here, abs=1e-9)

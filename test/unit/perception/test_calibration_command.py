@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagMessage, BagReader, BagWriter
-from knee_gap_core.values.rigid_transforms import inverse, to_vector
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, to_vector
 from knee_gap_perception.calibrate.bag_input import STEP_TOPIC, CalibrationBag
 from knee_gap_perception.calibrate.command import chosen_steps, main
 from knee_gap_perception.calibrate.recording import Recording, Request
@@ -17,7 +17,6 @@ from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.camera.medium import SALINE
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_simulation.calibration.bag import CalibrationRecording, calibration_truth, make_calibration_bag
-from knee_gap_simulation.rigid import transform
 
 BOARD = "charuco:12x9:3:2"
 
@@ -52,7 +51,7 @@ def test_a_bag_becomes_a_calibration(bag: Path, tmp_path: Path, capsys: pytest.C
         np.array(truth["T_body_lens"][key]) for key in ("quaternion_xyzw", "translation")
     )
     angle = 2 * np.arccos(quaternion[3])
-    true_lens = transform(quaternion[:3] / np.linalg.norm(quaternion[:3]) * angle, translation)
+    true_lens = from_rotation_vectors(quaternion[:3] / np.linalg.norm(quaternion[:3]) * angle, translation)
     error = to_vector(inverse(found.body_to_lens()) @ true_lens)
     assert np.linalg.norm(error[3:]) < 0.2e-3
     assert np.linalg.norm(error[:3]) < np.radians(0.2)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.calibration.bag import (
     CalibrationMotion,
     CalibrationRecording,
@@ -17,7 +18,6 @@ from knee_gap_simulation.calibration.bag import (
 from knee_gap_simulation.calibration.scene import BoardCamera, RotatedScope
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.make_bag import main
-from knee_gap_simulation.rigid import inverse
 
 SMALL = CalibrationRecording(seed=5, fps=5, board_s=0.6, oblique_s=0.6, pivot_s=0.5)
 

@@ -8,6 +8,7 @@ import pytest
 
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.user_files import FileError
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.contact_sheet import contact_sheet, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Difficulty, conditions
@@ -16,7 +17,6 @@ from knee_gap_simulation.knee_simulator import LEAST_CLEARANCE, KneeSimulator
 from knee_gap_simulation.make_bag import main
 from knee_gap_simulation.recordings.recording import IMAGE, LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
-from knee_gap_simulation.rigid import inverse
 
 # One seed and one texture level for most, as textures take longest to make.
 SEED = 17

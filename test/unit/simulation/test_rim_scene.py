@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.make_bag import Recording, main, make_bag
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
-from knee_gap_simulation.rigid import inverse, transform
 from knee_gap_simulation.rims.render import ScopeCamera
 from knee_gap_simulation.rims.scene import LOWER, UPPER, WALL, RimScene
 from knee_gap_simulation.scope.arthroscope import Scope
@@ -23,7 +23,7 @@ from knee_gap_simulation.scope.lens import Lens
 
 @pytest.fixture(scope="module")
 def truth() -> SceneTruth:
-    T_world_scene = transform([0.3, -0.8, 0.2], [0.1, 0.9, -0.4])
+    T_world_scene = from_rotation_vectors([0.3, -0.8, 0.2], [0.1, 0.9, -0.4])
     return SceneTruth(RimScene.random(0.004, 21), T_world_scene, Lens(), Scope())
 
 
@@ -56,7 +56,7 @@ def test_views_from_elsewhere_see_the_same_surface(truth, lens_poses):
 def test_first_hit_agrees_with_a_dense_walk_along_the_ray(truth):
     """No surface is crossed before the hit: march each ray in small steps and look for a change of side."""
     scene = truth.scene
-    T_scene_lens = transform([0.05, 0.1, 0.3], [0.001, 0.0008, -0.009])
+    T_scene_lens = from_rotation_vectors([0.05, 0.1, 0.3], [0.001, 0.0008, -0.009])
     pixels = np.random.default_rng(2).uniform([300.0, 20.0], [980.0, 700.0], (60, 2))
     bearings = truth.lens.bearings(pixels)
     bearings = bearings[np.isfinite(bearings[:, 0])]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.rigid import inverse
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.hand_motion import Hand, HandMotion, TravelDirection, minimum_jerk
 from knee_gap_simulation.scope.tracker import TrackerNoise, tracked_body

@@ -6,12 +6,12 @@ from scipy.optimize import differential_evolution, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.scene import KneeScene
 from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_simulation.recordings.section_truth import edge_contacts, section_truth, true_instrument_gap
-from knee_gap_simulation.rigid import inverse, transform
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.hand_motion import HandMotion
@@ -174,7 +174,9 @@ class Section:
     """A section of a scene: its lens, its edges' bearings, and what was found there."""
 
     def __init__(self, scene: KneeScene | RimScene, T_scene_lens: Array, place: Array) -> None:
-        self.truth = SceneTruth(scene, transform([0.4, -0.2, 0.9], [0.3, -0.1, 1.2]), Lens(), Scope())
+        self.truth = SceneTruth(
+            scene, from_rotation_vectors([0.4, -0.2, 0.9], [0.3, -0.1, 1.2]), Lens(), Scope()
+        )
         self.scene, self.T_scene_lens = scene, T_scene_lens
         self.T_world_lens = self.truth.T_world_scene @ T_scene_lens
         self.pixel = Lens().pixels(T_scene_lens[:3, :3].T @ (place - T_scene_lens[:3, 3]))
@@ -500,7 +502,9 @@ def test_the_truth_follows_the_edges_without_jumps(sections: dict[str, Section],
 def test_an_oblique_line_of_sight_touches_what_it_passes(yaw: float) -> None:
     """Rims far to the side, some of them behind the lens, are not what a line of sight comes closest to."""
     scene = RimScene.random(0.004, 7)
-    T_scene_lens = transform([0.0, np.radians(yaw), 0.0], [-np.radians(yaw) * 9e-3, 0.3e-3, -9e-3])
+    T_scene_lens = from_rotation_vectors(
+        [0.0, np.radians(yaw), 0.0], [-np.radians(yaw) * 9e-3, 0.3e-3, -9e-3]
+    )
     lens = T_scene_lens[:3, 3]
     upper, lower = scene.rim(0.2e-3)
     for inward in (0.0, 0.008):

@@ -20,6 +20,18 @@ def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
     return result
 
 
+def from_rotation_vectors(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
+    """Transforms (..., 4, 4) of rotation vectors (..., 3) [rad] and translations (..., 3) [m]."""
+    vectors = np.asarray(rotation, dtype=np.float64)
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape((*vectors.shape[:-1], 3, 3))
+    return rigid(matrices, translation)
+
+
+def quaternion_xyzw(T_a_b: npt.ArrayLike) -> Array:
+    """Unit quaternion (4,), order x y z w, w >= 0, of a transform's rotation."""
+    return np.asarray(Rotation.from_matrix(np.asarray(T_a_b)[:3, :3]).as_quat(canonical=True))
+
+
 def from_vector(vector: npt.ArrayLike) -> Array:
     """Transform (4, 4) of a rotation vector [rad] and a translation [m] in one array (6,)."""
     v = np.asarray(vector, dtype=np.float64)

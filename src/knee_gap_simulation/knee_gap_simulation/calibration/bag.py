@@ -15,6 +15,7 @@ import numpy as np
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, quaternion_xyzw
 from knee_gap_core.values.stamps import set_stamp
 from knee_gap_simulation.calibration.scene import Board, BoardCamera, ChessBoard, DotBoard, RotatedScope
 from knee_gap_simulation.errors import SimulationError
@@ -28,7 +29,6 @@ from knee_gap_simulation.recordings.recording import (
     POSE_LATENCY_NS,
     pose_message,
 )
-from knee_gap_simulation.rigid import inverse, quaternion_xyzw, transform
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.imaging import jpeg
 from knee_gap_simulation.scope.lens import Lens
@@ -142,7 +142,9 @@ def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
         lens=RefractedLens.of(lens, Media("air", recording.medium).ratio),
         scope=turned,
         board=BOARDS[recording.board],
-        T_world_board=transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5])),
+        T_world_board=from_rotation_vectors(
+            rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5])
+        ),
         tip=shaft[:3, 3] + TIP_BEYOND_LENS * shaft[:3, 2],
         pivot=rng.uniform([-0.4, 0.8, -0.4], [0.4, 1.1, 0.4]),
         time_offset=-recording.video_delay,
@@ -191,9 +193,9 @@ class CalibrationMotion:
         """``T_board_lens`` (4, 4)."""
         value = np.sum([waves(time) for waves in self._waves], axis=0)
         width, height = self._truth.board.size
-        target = transform(np.zeros(3), [width / 2 + value[3], height / 2 + value[4], 0.0])
-        orbit = transform([value[0], value[1], 0.0], np.zeros(3))
-        away = transform([0.0, 0.0, value[2]], [0.0, 0.0, -0.023 + value[5]])
+        target = from_rotation_vectors(np.zeros(3), [width / 2 + value[3], height / 2 + value[4], 0.0])
+        orbit = from_rotation_vectors([value[0], value[1], 0.0], np.zeros(3))
+        away = from_rotation_vectors([0.0, 0.0, value[2]], [0.0, 0.0, -0.023 + value[5]])
         return target @ orbit @ away
 
     def body(self, time: float) -> Array:
@@ -205,7 +207,7 @@ class CalibrationMotion:
         swing = np.array(
             [np.sin(2 * np.pi * self._swing[0] * since), np.cos(2 * np.pi * self._swing[1] * since), 0.0]
         )
-        pose = transform(0.32 * swing + [1.9, 0.0, 0.4 * np.sin(0.9 * since)], np.zeros(3))
+        pose = from_rotation_vectors(0.32 * swing + [1.9, 0.0, 0.4 * np.sin(0.9 * since)], np.zeros(3))
         pose[:3, 3] = self._truth.pivot - pose[:3, :3] @ self._truth.tip
         return pose
 
@@ -292,9 +294,9 @@ def _poses(
     reported = tracked_body(true @ T_body_lens, T_body_lens, recording.noise, rng)
     # A second body, on the light post: it turns with the scope, the first stays with the camera head.
     shaft = truth.scope.scope.body_to_shaft()
-    post = shaft @ transform([0.3, 0.2, 0.1], [0.04, 0.0, -0.15])
+    post = shaft @ from_rotation_vectors([0.3, 0.2, 0.1], [0.04, 0.0, -0.15])
     turns = np.array([motion.turn(time) for time in times])
-    turned = transform(turns[:, None] * [0.0, 0.0, 1.0], np.zeros((len(times), 3)))
+    turned = from_rotation_vectors(turns[:, None] * [0.0, 0.0, 1.0], np.zeros((len(times), 3)))
     posts = true @ shaft @ turned @ inverse(shaft) @ post
     posts = tracked_body(posts, np.eye(4), recording.noise, rng)
     for time, body, body_true, post in zip(times, reported, true, posts, strict=True):

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.rigid import transform
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_simulation.scope.notch import Notch
@@ -128,11 +128,11 @@ class RotatedScope:
     def body_to_lens(self, turn: float) -> Array:
         """``T_body_lens`` (4, 4): the tip turned about the shaft, the axes staying with the sensor."""
         shaft = self.scope.body_to_shaft()
-        tilt = transform([self.scope.oblique_angle, 0.0, 0.0], np.zeros(3))
-        tip = shaft @ transform([0.0, 0.0, turn], np.zeros(3)) @ tilt
+        tilt = from_rotation_vectors([self.scope.oblique_angle, 0.0, 0.0], np.zeros(3))
+        tip = shaft @ from_rotation_vectors([0.0, 0.0, turn], np.zeros(3)) @ tilt
         # The relay turns the picture by `turn` on the sensor: what the sensor calls x is the tip's x turned
         # back.
-        return tip @ transform([0.0, 0.0, -turn], np.zeros(3))
+        return tip @ from_rotation_vectors([0.0, 0.0, -turn], np.zeros(3))
 
 
 class BoardCamera:

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.knee.scene import KneeScene
-from knee_gap_simulation.rigid import inverse
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_simulation.surfaces.distance_field import CONDYLE, MENISCUS, PROBE
 

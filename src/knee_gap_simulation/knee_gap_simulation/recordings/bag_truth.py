@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
-from knee_gap_simulation.rigid import from_parts
 
 MaskAt = Callable[[int], npt.NDArray[np.bool_] | None]
 
@@ -28,7 +28,7 @@ def gap_masks(bag: Path) -> MaskAt | None:
                 message, stamp_ns = reader.deserialize(entry), reader.stamp_ns(entry)
                 p, q = message.pose.position, message.pose.orientation
                 turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-                poses[stamp_ns or 0] = from_parts(turn, [p.x, p.y, p.z])
+                poses[stamp_ns or 0] = rigid(turn, [p.x, p.y, p.z])
     except (SimulationError, BagError):
         return None
 

@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import inverse, quaternion_xyzw
 from knee_gap_core.values.stamps import set_stamp
-from knee_gap_simulation.rigid import inverse, quaternion_xyzw
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.clocks import stamp_ns
 from knee_gap_simulation.scope.lens import Lens

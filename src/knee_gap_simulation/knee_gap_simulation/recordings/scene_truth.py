@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from knee_gap_core.user_files import json_value
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.probe import Probe
 from knee_gap_simulation.knee.scene import KIND as KNEE
@@ -20,7 +21,6 @@ from knee_gap_simulation.recordings.section_truth import (
     section_truth,
     true_instrument_gap,
 )
-from knee_gap_simulation.rigid import inverse
 from knee_gap_simulation.rims.scene import KIND as RIMS
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.arthroscope import Scope

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_simulation.rigid import quaternion_xyzw, transform
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, quaternion_xyzw
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Scope:
 
     def body_to_shaft(self) -> Array:
         """``T_body_shaft`` (4, 4)."""
-        return transform(self.shaft_turn, self.shaft_origin)
+        return from_rotation_vectors(self.shaft_turn, self.shaft_origin)
 
     def body_to_lens(self) -> Array:
         """``T_body_lens`` (4, 4)."""
-        return self.body_to_shaft() @ transform([self.oblique_angle, 0.0, 0.0], np.zeros(3))
+        return self.body_to_shaft() @ from_rotation_vectors([self.oblique_angle, 0.0, 0.0], np.zeros(3))
 
     def shaft_in_lens(self) -> tuple[float, float, float]:
         """Direction of the shaft, to the tip, in the frame of the lens."""

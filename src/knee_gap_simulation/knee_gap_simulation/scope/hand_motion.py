@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, rigid
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.rigid import from_parts, transform
 
 
 class TravelDirection(StrEnum):
@@ -80,7 +80,9 @@ class HandMotion:
             raise SimulationError(f"the portal must lie in [0.01, 1] m behind the tip, not {portal}")
         self._hand = hand or Hand()
         self._offset = np.asarray(offset, dtype=np.float64)
-        view = transform([pitch, 0.0, 0.0], np.zeros(3)) @ transform([0.0, 0.0, roll], np.zeros(3))
+        view = from_rotation_vectors([pitch, 0.0, 0.0], np.zeros(3)) @ from_rotation_vectors(
+            [0.0, 0.0, roll], np.zeros(3)
+        )
         self._base_rotation = view[:3, :3]
         self._arm = None if portal is None else portal * self._base_rotation @ np.asarray(shaft, dtype=float)
         rng = np.random.default_rng([seed, 0x4841])
@@ -107,15 +109,15 @@ class HandMotion:
         position[..., self._axis] += self._travel * reached
         turn = self._tremor_turn(time) + self._drift_turn(time)
         if self._arm is not None:
-            wobble = transform(turn, np.zeros(3))[..., :3, :3]
-            return from_parts(wobble @ self._about_portal(reached) @ self._base_rotation, position)
+            wobble = from_rotation_vectors(turn, np.zeros(3))[..., :3, :3]
+            return rigid(wobble @ self._about_portal(reached) @ self._base_rotation, position)
         # A scope pivots about its portal: moving the lens to one side turns the view to the other.
         if self._axis == 0:
             turn[..., 1] -= self._hand.pivot_turn * reached
         elif self._axis == 1:
             turn[..., 0] += self._hand.pivot_turn * reached
-        rotation = transform(turn, np.zeros(3))[..., :3, :3] @ self._base_rotation
-        return from_parts(rotation, position)
+        rotation = from_rotation_vectors(turn, np.zeros(3))[..., :3, :3] @ self._base_rotation
+        return rigid(rotation, position)
 
     def _about_portal(self, reached: Array) -> Array:
         """Rotations (..., 3, 3) of a shaft that passes through the portal, for shares (...) of the travel."""
@@ -128,7 +130,7 @@ class HandMotion:
         sine = np.linalg.norm(across, axis=-1, keepdims=True)
         angle = np.arctan2(sine, (after @ before)[..., None])
         axis = np.divide(across, sine, out=np.zeros_like(across), where=sine > 0)
-        return np.asarray(transform(axis * angle, np.zeros(3))[..., :3, :3])
+        return np.asarray(from_rotation_vectors(axis * angle, np.zeros(3))[..., :3, :3])
 
 
 class _Wander:

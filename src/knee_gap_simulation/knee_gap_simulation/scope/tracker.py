@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.rigid import inverse, transform
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def tracked_body(
     sigma = np.array([noise.translation_error, noise.rotation_error]) / np.sqrt(3.0)
     shift = sigma[0] * rng.standard_normal((count, 3))
     turn = sigma[1] * rng.standard_normal((count, 3))
-    noisy = T_world_lens @ transform(turn, np.zeros((count, 3)))
+    noisy = T_world_lens @ from_rotation_vectors(turn, np.zeros((count, 3)))
     noisy[:, :3, 3] += shift
     return noisy @ inverse(T_body_lens)
 
@@ -56,4 +56,4 @@ def track_lens(
 def world_from_scene(seed: int) -> Array:
     """``T_world_scene`` (4, 4): a knee somewhere in the tracker's volume, turned anyhow."""
     rng = np.random.default_rng([seed, 0x574F])
-    return transform(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5]))
+    return from_rotation_vectors(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5]))
