@@ -5,7 +5,7 @@ NAME = "knee_gap_simulation"
 setup(
     name=NAME,
     version="0.1.0",
-    description="A knee whose gap is known, the scope that looks at it, the tracker that follows it.",
+    description="Simulated knees of known gap, with a simulated arthroscope and tracker.",
     license="Apache-2.0",
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",

@@ -82,7 +82,7 @@ def test_a_node_that_refuses_its_settings_ends_all_with_its_code(tmp_path: Path)
     params.write_text("/**/uncertainty_node:\n  ros__parameters:\n    interval: best\n")
     done = run(LIVE, "--params", str(params))
     assert done.returncode == 2
-    assert "ended with exit code 2; all ends" in done.stdout
+    assert "ended with exit code 2; stopping all" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
 
 
@@ -91,7 +91,7 @@ def test_a_player_that_fails_ends_the_replay_with_its_code(tmp_path: Path) -> No
     bag.write_bytes(b"not a bag, and yet not empty")
     done = run(REPLAY, str(bag))
     assert done.returncode == 1
-    assert "play ended with exit code 1; all ends" in done.stdout
+    assert "play ended with exit code 1; stopping all" in done.stdout
 
 
 def catches(pid: int, number: int) -> bool:
@@ -206,7 +206,7 @@ def test_a_node_that_is_killed_comes_back_and_goes_on_with_new_tracks(params: st
             assert before
 
             os.kill(live.pid("segmentation_node"), signal.SIGKILL)
-            live.wait("segmentation_node was ended by signal 9; started again in 0.5 s", 1)
+            live.wait("segmentation_node was ended by signal 9; restart in 0.5 s", 1)
             # Nothing that was measured with the node that is dead is repeated as new.
             client.spin(0.5)
             del gaps[:], edges[:]
@@ -222,7 +222,7 @@ def test_a_node_that_is_killed_comes_back_and_goes_on_with_new_tracks(params: st
             assert {message.track_id for message in valid(gaps)} <= after
 
             os.kill(live.pid("uncertainty_node"), signal.SIGKILL)
-            live.wait("uncertainty_node was ended by signal 9; started again in 0.5 s", 1)
+            live.wait("uncertainty_node was ended by signal 9; restart in 0.5 s", 1)
             live.wait("ready", 5)
             player.wait(60)
             client.spin(0.3)
@@ -247,8 +247,8 @@ def test_a_node_that_is_killed_comes_back_and_goes_on_with_new_tracks(params: st
     [
         (["replay.launch.py", "bag:=nowhere"], 1, "bag: nowhere does not exist"),
         (["replay.launch.py", f"bag:={SAMPLE}", f"out:={ROOT / 'bags'}"], 1, "exists already"),
-        (["replay.launch.py", f"bag:={ROOT / 'README.md'}"], 1, "play ended with exit code 1; all ends"),
-        (["live.launch.py"], 2, "tracking_node ended with exit code 2; all ends"),
+        (["replay.launch.py", f"bag:={ROOT / 'README.md'}"], 1, "play ended with exit code 1; stopping all"),
+        (["live.launch.py"], 2, "tracking_node ended with exit code 2; stopping all"),
     ],
 )
 def test_ros2_launch_ends_with_the_code_of_what_failed(arguments: list[str], code: int, words: str) -> None:
@@ -264,7 +264,7 @@ def test_without_respawn_the_end_of_a_node_ends_all_with_its_code(params: str, t
     others = [live.pid(name) for name in ("segmentation_node", "uncertainty_node")]
     os.kill(live.pid("tracking_node"), signal.SIGKILL)
     assert live.process.wait(60) == 128 + signal.SIGKILL
-    assert "tracking_node was ended by signal 9; all ends" in live.text
+    assert "tracking_node was ended by signal 9; stopping all" in live.text
     assert not any(Path(f"/proc/{pid}").exists() for pid in others)
 
 

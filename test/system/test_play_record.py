@@ -152,7 +152,7 @@ def test_a_late_recorder_still_gets_what_is_kept_for_it_and_names_what_never_cam
     time.sleep(0.5)
     assert signalled(processes, "record", signal.SIGTERM) == 0
     assert signalled(processes, "play", signal.SIGTERM) == 0
-    assert "nothing was received on /nobody" in processes.log("record").read_text()
+    assert "no message was received on /nobody" in processes.log("record").read_text()
     with BagReader(tmp_path / "out") as reader:
         assert list(reader.topics) == [INFO]
         assert len(list(reader.messages())) >= 1
@@ -181,7 +181,7 @@ def test_a_loop_begins_again_with_the_stamps_and_clock_of_the_bag(bag: Path, pro
         ("play", ["{bag}", "--rate", "fast"], "'fast' is not a number"),
         ("play", ["{bag}", "--topics", "/gap"], "has no topic /gap; it has /image, /info, /pose"),
         ("play", ["{bag}", "--backwards"], "unrecognized arguments: --backwards"),
-        ("play", ["{bag}", "--wait-for", "/pose", "--wait-timeout", "0.3"], "nobody subscribed to /pose"),
+        ("play", ["{bag}", "--wait-for", "/pose", "--wait-timeout", "0.3"], "no subscriber to /pose"),
         ("play", ["{bag}", "--ros-args", "-p", "speed:=2"], "no parameter speed"),
         ("play", ["{bag}", "--ros-args", "--nonsense"], "--nonsense"),
         ("record", ["{bag}", "/pose"], "exists already"),

@@ -1,1 +1,1 @@
-"""Start-up of the suite: launch files, settings, the demo and an example leg controller."""
+"""Start-up of the suite: launch files, parameters, the demo and an example leg controller."""

@@ -1,4 +1,4 @@
-"""What a simulated recording gave, beside its truth."""
+"""Comparison of the estimates of a simulated recording with its ground truth."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -25,12 +25,13 @@ _EDGE_SEEN = 1  # knee_gap_msgs/GapEdges
 
 @dataclass(frozen=True)
 class Comparison:
-    """Every estimate beside the truth; each array has one entry an estimate; metres, NaN if unknown.
+    """Every estimate and its ground truth; arrays with one entry per estimate, in metres, NaN if unknown.
 
-    `time` [s] counts from the first estimate. `truth` is the instrument gap of the section whose edges the
-    estimate's image gave; where it did not give both, of the section through the middle between its tracked
-    points. `point_truth` is the distance of the two surface points that the track's first image showed at
-    its pixels. The other fields are those of the same name of knee_gap_msgs/GapEstimate.
+    `time` [s] counts from the first estimate. `truth` is the instrument gap of the section whose edges were
+    found in the estimate's image. If not both were found, it is that of the section through the middle
+    between its tracked points. `point_truth` is the distance between the two surface points behind the
+    track's pixels in its first image. The other fields are those of the same name in
+    knee_gap_msgs/GapEstimate.
     """
 
     time: Floats
@@ -67,32 +68,32 @@ class Comparison:
 
     @property
     def inside(self) -> float:
-        """Share of the valid estimates whose [gap_min, gap_max] holds the truth [-]."""
+        """Fraction of the valid estimates whose [gap_min, gap_max] contains the truth [-]."""
         return self._share((self.gap_min <= self.truth) & (self.truth <= self.gap_max))
 
     @property
     def above_minimum(self) -> float:
-        """Share of the valid estimates whose gap_min is not above the truth [-]."""
+        """Fraction of the valid estimates whose gap_min is not above the truth [-]."""
         return self._share(self.gap_min <= self.truth)
 
     @property
     def below_maximum(self) -> float:
-        """Share of the valid estimates whose gap_max is not below the truth [-]."""
+        """Fraction of the valid estimates whose gap_max is not below the truth [-]."""
         return self._share(self.truth <= self.gap_max)
 
     @property
     def in_interval(self) -> float:
-        """Share of the valid estimates whose confidence interval holds the truth [-]."""
+        """Fraction of the valid estimates whose confidence interval contains the truth [-]."""
         return self._share((self.confidence_min <= self.truth) & (self.truth <= self.confidence_max))
 
     @property
     def points_inside(self) -> float:
-        """Share of the valid estimates whose bounds of the points' distance hold its truth [-]."""
+        """Fraction of the valid estimates whose bounds of the points' distance contain its truth [-]."""
         low, high = self.point_distance_min, self.point_distance_max
         return self._share((low <= self.point_truth) & (self.point_truth <= high))
 
     def summary(self) -> str:
-        """One line: how many, how many valid, how far from the truth."""
+        """One line: number of estimates, number of valid ones, errors and coverage."""
         return (
             f"{len(self.time)} estimates, {int(self.valid.sum())} valid, median |gap - truth| "
             f"{1e3 * self.median_error:.3f} mm, truth inside [min, max] {100 * self.inside:.1f} % "
@@ -105,17 +106,17 @@ class Comparison:
         return float(np.median(chosen)) if chosen.size else float("nan")
 
     def _share(self, held: npt.NDArray[np.bool_]) -> float:
-        # An unknown truth counts as not held.
+        # An unknown truth counts as not contained.
         return float(np.mean(held[self.valid])) if self.valid.any() else float("nan")
 
 
-# What is not read from the estimate under its own name.
+# Fields that are not copied from the estimate under their own name.
 _FOUND = ("time", "valid", "truth", "point_truth")
 _READ = tuple(entry.name for entry in fields(Comparison) if entry.name not in _FOUND)
 
 
 def compare(recording: Path, output: Path) -> Comparison:
-    """Read the estimates of `output` beside the truth that the simulated bag `recording` carries.
+    """Return the estimates of `output` with the ground truth in the simulated bag `recording`.
 
     Raises BagError for a bag that cannot be read and SimulationError for one that is not simulated.
     """
@@ -134,14 +135,14 @@ def compare(recording: Path, output: Path) -> Comparison:
                 columns[name].append(getattr(estimate, name))
     arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
     valid = arrays.pop("valid").astype(bool)
-    # Counted from the first while they are whole numbers: seconds since 1970 are no better than 0.2 us.
+    # Differences of whole nanoseconds: seconds since 1970 as floats resolve only 0.2 us.
     first = min(stamps, default=0)
     time = np.array([1e-9 * (stamp - first) for stamp in stamps])
     return Comparison(time=time, valid=valid, **arrays)
 
 
 class _Truths:
-    """The truth of a recording at the stamps of its images, of what an output says it looked at."""
+    """Ground truth of a recording at the stamps of its images, for the points and sections of an output."""
 
     def __init__(self, recording: Path, output: Path) -> None:
         with BagReader(recording) as bag:
@@ -182,8 +183,8 @@ class _Truths:
 def true_gap(scene: SceneTruth, T_world_lens: Array, edges: Any) -> float:
     """True instrument gap [m] at the section of a GapEdges message, seen from a true lens pose (4, 4).
 
-    Where it does not give both edges, the section leads through the middle between its tracked points. NaN
-    where that is not in the opening.
+    If it does not have both edges, the section leads through the middle between its tracked points. NaN if
+    that is not in the opening.
     """
     bearings = np.array([[edge.x, edge.y, edge.z] for edge in (edges.edge_0, edges.edge_1)])
     if not edges.edge_state_0 == edges.edge_state_1 == _EDGE_SEEN:

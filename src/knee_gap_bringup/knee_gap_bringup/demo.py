@@ -1,4 +1,4 @@
-"""The demo: a bag, in real time, through three live nodes over DDS, and what they said beside the truth."""
+"""The demo: a bag played in real time to the live nodes over DDS, and their output compared with truth."""
 
 import os
 import shutil
@@ -28,34 +28,34 @@ RECORDED = (
     *(f"{GAP}/{name}" for name in ("min", "max", "snr")),
 )
 RECORDING = "gap.mcap"
-# Time the nodes have to come up: the first start after a build compiles the kernels.
+# Time allowed for the nodes to start [s]: the first start after a build compiles the kernels.
 START_TIMEOUT = 120.0
-# The longest that segmentation_node lets an image wait for the pose after it [s].
+# Longest time that segmentation_node waits for the pose after an image [s].
 LONGEST_POSE_WAIT = 0.1
 
 
 def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) -> Path:
     """Play `bag` through the live nodes; return the recording of their output. Raises StartError."""
     recording = out / RECORDING
-    # A domain of its own: another demo or a robot on this machine must not be heard.
+    # A ROS domain of its own, so that it does not receive from another demo or a robot on this machine.
     domain = os.environ.get("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     with Processes(out, {"ROS_DOMAIN_ID": domain}) as processes:
         processes.start("record", [executable("knee_gap_replay", "record"), str(recording), *RECORDED])
         for node, package in NODES.items():
             command = [executable(package, node), "--ros-args", "-r", f"__ns:={NAMESPACE}"]
             if rate != 1.0:
-                # Waiting is then measured by the bag's clock.
+                # Waiting times are then measured by the bag's clock.
                 command += ["-p", "use_sim_time:=true"]
             command += scope_arguments(node, bag)
             if node == "segmentation_node":
                 command += ["-p", "image_transport:=compressed"]
                 if rate < 1.0:
-                    # Played slowly so that nothing is lost: then no pose shall come too late either.
+                    # Played slowly so that nothing is lost: no pose is to arrive too late either.
                     command += ["-p", f"max_pose_wait:={LONGEST_POSE_WAIT}"]
             processes.start(node, command)
         processes.wait_ready(list(NODES), START_TIMEOUT)
         topics = [IMAGE, CAMERA_INFO, BODY_POSE]
-        # Two seconds in which nodes and recorder find each other.
+        # Two seconds for the nodes and the recorder to discover each other.
         play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "2"]
         if rate != 1.0:
             play += ["--clock", "--rate", str(rate)]
@@ -76,10 +76,10 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
 
 
 def scope_arguments(node: str, bag: Path) -> list[str]:
-    """What a node is given of the scope: the calibration beside the bag, or where its lens nominally sits."""
+    """Parameters that describe the scope to a node: the bag's calibration, or the lens's nominal pose."""
     calibration = bag / CALIBRATION_FILE
     if calibration.is_file():
-        # The same for the two nodes that use it; uncertainty_node is told by them.
+        # The same for the two nodes that use it; uncertainty_node receives it from them.
         return [] if node == "uncertainty_node" else ["-p", f"calibration_file:={calibration.resolve()}"]
     return ["--params-file", str(bag / PARAMETERS_FILE)] if node == "tracking_node" else []
 
@@ -87,11 +87,11 @@ def scope_arguments(node: str, bag: Path) -> list[str]:
 def run(bag: Path, out: Path, rate: float) -> None:
     """Play, record, compare and draw."""
     begin = time.monotonic()
-    with BagReader(bag) as reader:  # refuses what is no bag before anything is started or removed
+    with BagReader(bag) as reader:  # raises if it is not a bag, before anything is started or removed
         if missing := {IMAGE, CAMERA_INFO, BODY_POSE} - set(reader.topics):
             raise BagError(f"{bag} has no topic {', '.join(sorted(missing))}")
     if not (bag / PARAMETERS_FILE).is_file():
-        raise BagError(f"{bag} has no {PARAMETERS_FILE}, which says where the lens sits on the tracked body")
+        raise BagError(f"{bag} has no {PARAMETERS_FILE} with the pose of the lens on the tracked body")
     out.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out / RECORDING, ignore_errors=True)
     recording = play_through_nodes(bag, out, begin, rate)
@@ -102,13 +102,13 @@ def run(bag: Path, out: Path, rate: float) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the demo; 0 when it ran through."""
+    """Run the demo; return 0 if it ran to the end."""
     parser = Parser(prog="demo", description=__doc__)
     parser.add_argument("--bag", type=Path, default=Path("bags/sample"), help="simulated bag to play")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
     parser.add_argument("--rate", type=finite, default=1.0, help="times as fast as recorded")
     arguments = parser.parse_args(argv)
-    # Whoever ends the demo, by Ctrl-C or otherwise, ends its processes with it.
+    # A signal that ends the demo, from Ctrl-C or otherwise, ends its processes with it.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if not 0.01 <= arguments.rate <= 100.0:

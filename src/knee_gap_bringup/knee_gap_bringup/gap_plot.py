@@ -1,4 +1,4 @@
-"""The picture of a recording: gap, bounds, truth and signal-to-noise ratio over time."""
+"""Plot of a recording: gap, bounds, truth and signal-to-noise ratio over time."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ BLUE, ORANGE, GREY = "#1f4e8c", "#d1651a", "#6b6b6b"
 
 
 def write_gap_plot(comparison: Comparison, path: Path, title: str) -> None:
-    """Write the picture as PNG. Only valid estimates are drawn; where there is none the band is empty."""
+    """Write the plot as PNG. Only valid estimates are drawn; elsewhere the band is empty."""
     figure, (top, bottom) = plt.subplots(
         2, 1, figsize=(10, 6.2), sharex=True, height_ratios=(3, 1), layout="constrained"
     )

@@ -1,9 +1,9 @@
-"""An example of what a leg controller does with the instrument gap: open until the instrument fits.
+"""The ROS-free core of an example leg controller: it opens the joint until the instrument fits.
 
-A gap is measured while the joint holds still. So the leg opens by a step, stops, comes to rest, and the gap
-is measured again, by a track that began at rest. Every estimate is judged by the same rules, at rest and
-inside a step; one that is refused stops the leg at once. What contradicts itself holds the leg until a person
-resets it. Nothing here knows ROS; `Estimate.from_message` reads messages of rclpy and of bags.
+A gap is measured while the joint is at rest. So the leg opens by a step, stops, comes to rest, and the gap is
+measured again by a track that began at rest. Every estimate is checked by the same rules, at rest and during
+a step; a rejected estimate stops the leg at once. Contradictory estimates hold the leg until a person resets
+it. `Estimate.from_message` reads messages of rclpy and of bags.
 """
 
 from dataclasses import dataclass, field
@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, Self
 
 from knee_gap_core.values.stamps import NANOSECONDS, stamp_ns
 
-# GapEstimate's constants, for a core without messages; a test compares them.
+# GapEstimate's constants, since the core does not import messages; a test compares them.
 STATUS_VALID = 1
 INTERVALS = {0: "worst_case", 1: "paper"}
 
-# How far in the future a stamp may lie: clocks of two machines that are kept in step [s].
+# Largest time by which a stamp may be in the future [s]: error between two synchronised clocks.
 MOST_AHEAD = 0.05
-# How often `LegControl.on_time` is to be called at least, which ends a step in time [s].
+# Longest time between two calls of `LegControl.on_time`, so that a step ends in time [s].
 TICK = 0.02
 # Tracks remembered by the time of their first image; the oldest are forgotten.
 MOST_TRACKS = 4096
@@ -28,7 +28,7 @@ ANEW = "the joint has moved since this track began"
 
 
 class Action(StrEnum):
-    """What the leg should do, in words."""
+    """Action of the leg."""
 
     HOLD = "hold"
     OPEN = "open"
@@ -36,7 +36,7 @@ class Action(StrEnum):
 
 
 class Command(NamedTuple):
-    """Rate at which the joint should open [m/s] and why; `measure_again`: the track shall end now."""
+    """Rate at which the joint should open [m/s], and the reason; `measure_again`: the track is to end now."""
 
     action: Action
     opening_rate: float
@@ -45,10 +45,10 @@ class Command(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What the controller looks at in a GapEstimate.
+    """The fields of a GapEstimate that the controller uses.
 
-    Lengths [m]; `stamp_ns` of the image [ns] and `age` [s], its distance from the node's clock.
-    `sequence`: the publisher's number of the message, None where the middleware has none.
+    Lengths [m]; `stamp_ns` of the image [ns]; `age` [s] is its distance from the node's clock. `sequence` is
+    the publisher's sequence number, None if the middleware has none.
     """
 
     is_valid: bool
@@ -63,7 +63,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def from_message(cls, message: Any, now_ns: int, sequence: int | None = None) -> Self:
-        """Return what a GapEstimate, of rclpy or of a bag, states when the node's clock is `now_ns`."""
+        """Return the fields of a GapEstimate, of rclpy or of a bag; `now_ns` is by the node's clock."""
         stamp = stamp_ns(message.header)
         return cls(
             is_valid=message.status == STATUS_VALID,
@@ -88,7 +88,7 @@ class LegParameters:
     )
     largest_gap: float = field(
         default=0.012,
-        metadata={"description": "gap that the joint's limits allow [m]", "range": (0.001, 0.03)},
+        metadata={"description": "largest gap that the joint's limits allow [m]", "range": (0.001, 0.03)},
     )
     opening_rate: float = field(
         default=0.001,
@@ -96,35 +96,35 @@ class LegParameters:
     )
     opening_step: float = field(
         default=0.5,
-        metadata={"description": "time for which the joint is opened at once [s]", "range": (0.05, 5.0)},
+        metadata={"description": "duration of one opening step [s]", "range": (0.05, 5.0)},
     )
     settling: float = field(
         default=0.5,
-        metadata={"description": "time after which the leg is at rest again [s]", "range": (0.05, 10.0)},
+        metadata={"description": "time for the leg to come to rest after a step [s]", "range": (0.05, 10.0)},
     )
     deadline: float = field(
         default=0.2,
-        metadata={"description": "silence of the gap after which the leg is held [s]", "range": (0.1, 5.0)},
+        metadata={"description": "time without an estimate before the leg is held [s]", "range": (0.1, 5.0)},
     )
 
     max_age: float = field(
         default=0.5,
         metadata={
-            "description": "age of an estimate, by its stamp, above which the leg is held, no less than "
-            "max_delay of uncertainty_node; a bag that is played needs --clock and use_sim_time [s]",
+            "description": "age of an estimate, by its stamp, above which the leg is held [s]; at least "
+            "max_delay of uncertainty_node; with a played bag, set --clock and use_sim_time",
             "range": (0.05, 10.0),
         },
     )
     interval: str = field(
         default="worst_case",
         metadata={
-            "description": "interval that estimates must have; paper does not always hold the truth",
+            "description": "error model required of estimates; paper does not always contain the truth",
             "choices": tuple(INTERVALS.values()),
         },
     )
 
     def __post_init__(self) -> None:
-        """Refuse a leg that may not open as far as the instrument needs."""
+        """Raise ValueError if the leg may not open as far as the instrument needs."""
         if not self.largest_gap > self.instrument_diameter:
             raise ValueError(
                 f"largest_gap ({self.largest_gap} m) must exceed instrument_diameter "
@@ -140,7 +140,7 @@ def hold(reason: str) -> Command:
 
 
 def fault_of(estimate: Estimate) -> str:
-    """Why an estimate contradicts itself: it is valid by its status and cannot be; empty if it does not."""
+    """Why an estimate with the status VALID contradicts itself; empty if it does not."""
     if not estimate.is_valid:
         return ""
     if estimate.track_id == 0:
@@ -153,7 +153,7 @@ def fault_of(estimate: Estimate) -> str:
 
 
 def refusal_of(estimate: Estimate, parameters: LegParameters) -> str:
-    """Why nothing may be done on an estimate by itself; empty if it may be acted on."""
+    """Why an estimate must not be acted on, by itself; empty if it may be."""
     if fault := fault_of(estimate):
         return fault
     if not estimate.is_valid:
@@ -161,14 +161,14 @@ def refusal_of(estimate: Estimate, parameters: LegParameters) -> str:
     if not estimate.gap_min > 0.0:
         return "the gap may be closed"
     if not -MOST_AHEAD <= estimate.age <= parameters.max_age:
-        return "the estimate is not of now"
+        return "the estimate is too old or in the future"
     if estimate.interval != parameters.interval:
         return f"the interval is {estimate.interval}, not {parameters.interval}"
     return ""
 
 
 def decide(estimate: Estimate, parameters: LegParameters) -> Command:
-    """Command from one estimate of a joint at rest: its lower bound decides whether the instrument fits."""
+    """Command for one estimate of a joint at rest: its lower bound decides whether the instrument fits."""
     if refusal := refusal_of(estimate, parameters):
         return hold(refusal)
     if estimate.gap_min >= parameters.instrument_diameter:
@@ -179,24 +179,24 @@ def decide(estimate: Estimate, parameters: LegParameters) -> Command:
 
 
 class LegControl:
-    """Opens by a step, waits until the leg is at rest, and acts on nothing but a track that began after that.
+    """Opens by a step, waits until the leg is at rest, and then acts only on a track that began after that.
 
-    `on_estimate` takes each estimate, `on_time` the time at least every `TICK`, `on_publishers` who publishes
-    the gap; `now` is a time [s] that never runs backwards. A contradiction is kept in `fault`, and the leg
+    `on_estimate` takes each estimate, `on_time` the time at least every `TICK`, `on_publishers` the
+    publishers of the gap; `now` is a monotonic time [s]. A contradiction is kept in `fault`, and the leg is
     held, until `reset`.
     """
 
     def __init__(self, parameters: LegParameters) -> None:
         self.parameters = parameters
         self.fault = ""
-        # Until when the leg opens, on which track, and until when it comes to rest; None where it is at rest.
+        # End of the opening step, its track, and end of coming to rest; None if the leg is at rest.
         self._opens_until: float | None = None
         self._step_track = 0
         self._rests_from: float | None = None
-        # Since when the leg is at rest, and when the first image of each track was taken.
+        # Time since which the leg is at rest, and time of the first image of each track.
         self._at_rest_since = -float("inf")
         self._first_image: dict[int, float] = {}
-        # The estimate with the latest stamp, and the latest stamp of an estimate of a track.
+        # The estimate with the latest stamp, and the latest stamp of an estimate with a track.
         self._latest: Estimate | None = None
         self._image_ns: int | None = None
         self._sequence = -1
@@ -205,11 +205,11 @@ class LegControl:
         self._publishers: frozenset[str] = frozenset()
 
     def on_estimate(self, estimate: Estimate, now: float) -> Command:
-        """Command after an estimate that came `now`."""
+        """Command for an estimate received at `now`."""
         self._heard = now
         self._note_track(estimate, now)
         contradiction = fault_of(estimate) or self._contradiction(estimate)
-        # A statement without a track may be a moment ahead of the image that comes after it.
+        # The stamp of an estimate without a track can be slightly later than that of the next image.
         overtaken = self._latest is not None and estimate.stamp_ns < self._latest.stamp_ns
         if not overtaken:
             self._latest = estimate
@@ -221,11 +221,11 @@ class LegControl:
             return waiting
         command = decide(estimate, self.parameters)
         if overtaken:
-            command = hold("a later statement came before this estimate")
+            command = hold("a later estimate was received before this one")
         if self._opens_until is not None:
             return self._inside_step(command, estimate, now)
         if not self._first_image.get(estimate.track_id, float("nan")) >= self._at_rest_since:
-            # Also where no time of a first image is known.
+            # Also if the time of the first image is unknown.
             command = hold(ANEW) if estimate.is_valid else command
         if command.action is Action.OPEN:
             opening = min(self.parameters.opening_step, _time_to_limit(estimate, self.parameters))
@@ -233,7 +233,7 @@ class LegControl:
         return command
 
     def on_time(self, now: float) -> Command | None:
-        """Command that the passing of time makes, None if it makes none: the end of a step, and silence."""
+        """Command due to the passing of time, None if there is none: end of a step, or no estimate."""
         if self._opens_until is not None and now >= self._opens_until:
             return self._stop(now, "the step is over")
         if self._heard is None or now - self._heard > self.parameters.deadline:
@@ -241,13 +241,13 @@ class LegControl:
         return self._while_held(now)
 
     def on_silence(self, now: float) -> Command:
-        """Hold the leg: the gap is late, or its node is dead."""
+        """Hold the leg: the estimate is late, or its node has died."""
         if self._opens_until is not None:
             self._stop(now, "")
         return self._while_held(now) or hold("no estimate within the deadline")
 
     def on_publishers(self, publishers: frozenset[str], now: float) -> Command | None:
-        """Command after a look at who publishes the gap: it must be one, and the same until a reset."""
+        """Command for the present publishers of the gap: exactly one, and the same until a reset."""
         self._publishers = publishers
         if len(publishers) > 1:
             return self.on_fault(f"{len(publishers)} nodes publish the gap", now)
@@ -265,9 +265,9 @@ class LegControl:
         return self._while_held(now) or hold(self.fault)
 
     def reset(self, now: float) -> str:
-        """Forget a fault, as a person asked; return why that is not possible yet, empty if it was.
+        """Clear a fault on a person's request; return why that is not possible yet, empty if it was cleared.
 
-        The leg is taken to have moved: the gap is measured again before anything is done.
+        The leg is assumed to have moved: the gap is measured again before any action.
         """
         if len(self._publishers) > 1:
             return f"{len(self._publishers)} nodes publish the gap; end all but one first"
@@ -286,27 +286,27 @@ class LegControl:
             return self._stop(now, "another track")
         if now >= self._opens_until:
             return self._stop(now, "the step is over")
-        # As the joint opens the limit comes nearer.
+        # As the joint opens, the remaining time to its limit decreases.
         self._opens_until = min(self._opens_until, now + _time_to_limit(estimate, self.parameters))
         return command._replace(reason="a step")
 
     def _while_held(self, now: float) -> Command | None:
-        """Command while a fault or the leg's coming to rest decides, None if neither does."""
+        """Command during a fault or while the leg comes to rest, None otherwise."""
         if self.fault:
             return hold(f"{self.fault}: held until a person resets it")
         if self._rests_from is None:
             return None
         if now < self._rests_from:
-            return hold("the leg comes to rest")
+            return hold("the leg is coming to rest")
         self._at_rest_since, self._rests_from = self._rests_from, None
-        return hold("the joint has moved: the gap is measured again")._replace(measure_again=True)
+        return hold("the joint has moved: measuring the gap again")._replace(measure_again=True)
 
     def _note_track(self, estimate: Estimate, now: float) -> None:
-        """Remember when the first image of a track was taken, as far as it was heard of."""
+        """Store the time of the first received image of a track."""
         if estimate.track_id and estimate.track_id not in self._first_image:
             if len(self._first_image) >= MOST_TRACKS:
                 del self._first_image[next(iter(self._first_image))]
-            # A stamp in the future makes no track newer.
+            # A stamp in the future does not make a track newer.
             self._first_image[estimate.track_id] = now - max(estimate.age, 0.0)
 
     def _contradiction(self, estimate: Estimate) -> str:
@@ -319,7 +319,7 @@ class LegControl:
         if latest is None:
             return ""
         if estimate.stamp_ns == latest.stamp_ns:
-            # Two statements without a track claim nothing that could differ.
+            # Two estimates without a track have no numbers that could differ.
             differ = latest.track_id or estimate.track_id or latest.is_valid or estimate.is_valid
             return "two messages of one stamp differ" if differ and not _agree(estimate, latest) else ""
         back = (latest.stamp_ns - estimate.stamp_ns) / NANOSECONDS
@@ -340,7 +340,7 @@ def _time_to_limit(estimate: Estimate, parameters: LegParameters) -> float:
 
 
 def _agree(one: Estimate, other: Estimate) -> bool:
-    """Whether two messages of one stamp state the same; unknown is the same as unknown."""
+    """Whether two messages with the same stamp agree; NaN equals NaN."""
     pairs = zip(
         (one.is_valid, one.track_id, one.interval, one.gap, one.gap_min, one.gap_max),
         (other.is_valid, other.track_id, other.interval, other.gap, other.gap_min, other.gap_max),

@@ -1,4 +1,4 @@
-"""leg_controller_node: an example subscriber of gap that moves nothing unless the gap is known."""
+"""leg_controller_node: an example subscriber of gap that commands no motion unless the gap is known."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,15 +14,15 @@ from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegCon
 from knee_gap_core.node.base_node import RESULT_QOS, BaseNode, run
 from knee_gap_msgs.msg import GapEstimate
 
-# The frame of the command: its x axis is the direction in which the joint opens.
+# Frame of the command: its x axis is the direction in which the joint opens.
 LEG_FRAME = "leg"
 
 
 class LegControllerNode(BaseNode):
-    """Converts, decides, publishes the rate at which the joint should open [m/s].
+    """Publishes the rate at which the joint should open [m/s].
 
-    The command is a TwistStamped, as velocity commands of ROS's controllers are: `linear.x` along the opening
-    of the joint, stamped when it was made, repeated every `TICK`. Hold the leg if none came for 0.1 s.
+    The command is a TwistStamped, as for ROS's velocity controllers: `linear.x` along the opening of the
+    joint, with the present stamp, repeated every `TICK`. Hold the leg if no command is received for 0.1 s.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class LegControllerNode(BaseNode):
         self._rate = self.create_publisher(TwistStamped, "leg/command", RESULT_QOS)
         self.create_service(Trigger, "~/reset", self.on_reset)
         qos = QoSProfile(
-            # Deep enough that no message inside a step is skipped for a newer one.
+            # Deep enough that no message within a step is dropped for a newer one.
             depth=RESULT_QOS.depth,
             reliability=RESULT_QOS.reliability,
             deadline=Duration(nanoseconds=int(self._control.parameters.deadline * 1e9)),
@@ -46,7 +46,7 @@ class LegControllerNode(BaseNode):
             qos,
             event_callbacks=SubscriptionEventCallbacks(deadline=self.on_silence),
         )
-        # By the steady clock: a bag's clock that stops must not keep the leg moving.
+        # On the steady clock: the leg must not keep moving if a bag's clock stops.
         self._tick = self.create_timer(TICK, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_gap(self, message: GapEstimate, info: Mapping[str, int | None]) -> None:
@@ -61,11 +61,11 @@ class LegControllerNode(BaseNode):
         self.command(decide)
 
     def on_silence(self, _event: object) -> None:
-        """Hold the leg: the gap is late, or its node is dead."""
+        """Hold the leg: the estimate is late, or its node has died."""
         self.command(lambda: self._control.on_silence(time.monotonic()))
 
     def on_tick(self) -> None:
-        """Let time pass, look who publishes the gap, and repeat the command."""
+        """Advance the time, check the publishers of the gap, and repeat the command."""
 
         def decide() -> Command:
             fault = self._control.on_publishers(self.publishers(), time.monotonic())
@@ -74,7 +74,7 @@ class LegControllerNode(BaseNode):
         self.command(decide)
 
     def on_reset(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        """Forget a fault, as a person asks; the gap is then measured again."""
+        """Clear a fault on a person's request; the gap is then measured again."""
         fault = self._control.fault
         answer.message = self._control.reset(time.monotonic())
         answer.success = not answer.message
@@ -84,7 +84,7 @@ class LegControllerNode(BaseNode):
         return answer
 
     def publishers(self) -> frozenset[str]:
-        """Who publishes the gap, as discovered, by the middleware's ids."""
+        """Discovered publishers of the gap, by the middleware's ids."""
         known = self.get_publishers_info_by_topic(self._subscription.topic_name)
         return frozenset(bytes(one.endpoint_gid).hex() for one in known)
 
@@ -95,10 +95,10 @@ class LegControllerNode(BaseNode):
         except Exception as error:  # the leg is held whatever went wrong
             command = self._control.on_fault(f"the controller failed: {error!r}", time.monotonic())
         if command.measure_again:
-            # Without an answer the leg is held: the old track is not used any more.
+            # Without a response the leg is held: the old track is not used any more.
             self._measure_again.call_async(Trigger.Request())
         self.log(command)
-        # A request is made once, however often the command is repeated.
+        # The request is sent once, even if the command is repeated.
         self._command = command._replace(measure_again=False)
         message = TwistStamped()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -107,7 +107,7 @@ class LegControllerNode(BaseNode):
         self._rate.publish(message)
 
     def log(self, command: Command) -> None:
-        """Log what changes; a fault as an error."""
+        """Log changes of the command; a fault as an error."""
         if command.action is self._command.action and (
             command.reason == self._command.reason or command.action is Action.OPEN
         ):

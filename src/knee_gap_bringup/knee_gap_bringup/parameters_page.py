@@ -1,4 +1,4 @@
-"""Every parameter of every node as a page, docs/parameters.md: run this module, it prints the page."""
+"""The page docs/parameters.md, with every parameter of every node; run as a module, it prints the page."""
 
 import sys
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ def page() -> Iterator[str]:
     """Yield the lines of the page."""
     yield "# Parameters"
     yield ""
-    yield ("Printed by `tools/env python -m knee_gap_bringup.parameters_page`. They are read-only; SI units.")
+    yield "Printed by `tools/env python -m knee_gap_bringup.parameters_page`. All are read-only; SI units."
     for node, kinds in NODES.items():
         yield ""
         yield f"## {node}"
@@ -39,7 +39,7 @@ def row(field: "Field[Any]") -> str:
 
 
 def allowed(field: "Field[Any]") -> str:
-    """The values that a parameter takes."""
+    """Allowed values of a parameter."""
     if choices := field.metadata.get("choices"):
         return ", ".join(choices)
     if limits := field.metadata.get("range"):
@@ -49,7 +49,7 @@ def allowed(field: "Field[Any]") -> str:
 
 
 def shown(value: object) -> str:
-    """A default as a reader wants it."""
+    """A default value in readable form."""
     if isinstance(value, tuple):
         return ", ".join(shown(item) for item in value)
     if isinstance(value, float):

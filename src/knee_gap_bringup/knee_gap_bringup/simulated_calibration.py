@@ -1,10 +1,10 @@
-"""A calibration of the scope of a simulated bag, as `calibrate` would have found it.
+"""A simulated calibration of the scope of a simulated bag, with the errors of a real calibration.
 
     tools/env python -m knee_gap_bringup.simulated_calibration bags/sample
 
-writes calibration.yaml beside the bag. Its standard errors are those that `calibrate all` states for a
-simulated calibration bag (docs/calibration.md), and its numbers are off the true ones by errors drawn from
-them, so that what it promises is put to the test.
+writes calibration.yaml to the bag's folder. Its standard errors are those of `calibrate all` on a simulated
+calibration bag (docs/calibration.md). Its values deviate from the true ones by errors drawn from them, so
+that the stated accuracy is tested.
 """
 
 import argparse
@@ -37,9 +37,9 @@ REPROJECTION_PX = 0.057
 
 
 def simulated_calibration(truth: SceneTruth, seed: int) -> Calibration:
-    """A calibration of the scope and lens of a scene, wrong by errors drawn from what it states."""
+    """A calibration of the scope and lens of a scene, with errors drawn from its own standard errors."""
     rng = np.random.default_rng([seed, 12])
-    # In the medium of its calibration, whose angles the file states.
+    # In the medium of its calibration, to which the file's angles refer.
     lens, T_body_lens = calibrated(truth.lens), truth.scope.body_to_lens()
     focal, x, y = lens.focal_px, lens.centre_x_px, lens.centre_y_px
     camera = np.array([focal, focal, x, y, 0.0, 0.0, 0.0, 0.0]) + CAMERA * rng.standard_normal(8)
@@ -79,7 +79,7 @@ def simulated_calibration(truth: SceneTruth, seed: int) -> Calibration:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the calibration; 1 where the bag is none or not simulated."""
+    """Write the calibration; return 1 if the bag is not a bag or not simulated."""
     parser = argparse.ArgumentParser(prog="simulated_calibration", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("bag", type=Path)
     parser.add_argument("--seed", type=int, default=7)

@@ -1,8 +1,8 @@
 """The three nodes on live topics: `ros2 launch knee_gap_bringup live.launch.py params:=my_scope.yaml`.
 
-The file says all that a laboratory has to set, whether images come compressed included; config/knee_gap.yaml
-is one to begin with. A node that ends is started again (respawn:=false for none), except for one that refuses
-its settings: that ends the launch with its exit code.
+The file has all parameters that a laboratory has to set, including image_transport; config/knee_gap.yaml is a
+template. A node that ends is restarted (respawn:=false to turn this off). A node that refuses its parameters
+ends the launch with its exit code.
 """
 
 from pathlib import Path
@@ -41,10 +41,10 @@ def generate_launch_description() -> LaunchDescription:
                 "respawn",
                 default_value="true",
                 choices=["true", "false"],
-                description="start a node that ended again",
+                description="restart a node that ended",
             ),
             DeclareLaunchArgument(
-                "respawn_delay", default_value=str(RESPAWN_DELAY), description="pause before that [s]"
+                "respawn_delay", default_value=str(RESPAWN_DELAY), description="pause before a restart [s]"
             ),
             IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
             OpaqueFunction(function=start),

@@ -1,7 +1,6 @@
-"""A bag through the three nodes: `ros2 launch knee_gap_bringup replay.launch.py bag:=bags/sample`.
+"""A bag played to the three nodes: `ros2 launch knee_gap_bringup replay.launch.py bag:=bags/sample`.
 
-It ends when the bag does; with another exit code than 0 if there is no bag, if `out` exists, or if a process
-fails.
+It ends with the bag. The exit code is not 0 if there is no bag, if `out` exists, or if a process fails.
 """
 
 from pathlib import Path
@@ -33,10 +32,10 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag", description="bag folder or .mcap file"),
-            DeclareLaunchArgument("out", default_value="", description="bag to record the results in"),
+            DeclareLaunchArgument("out", default_value="", description="bag to record the results to"),
             DeclareLaunchArgument("rate", default_value="1.0"),
             DeclareLaunchArgument(
-                "params", default_value="", description="parameters of the nodes; scope.yaml of the bag"
+                "params", default_value="", description="parameter file of the nodes; scope.yaml of the bag"
             ),
             DeclareLaunchArgument("namespace", default_value="knee_gap"),
             IncludeLaunchDescription(transport),

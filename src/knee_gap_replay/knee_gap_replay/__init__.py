@@ -1,1 +1,1 @@
-"""Everything that reads or writes bags: play, record, process, check."""
+"""Commands that read or write bags: play, record, process, check, evaluate, import_motive."""

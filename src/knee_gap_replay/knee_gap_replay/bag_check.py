@@ -1,4 +1,4 @@
-"""What a bag holds and whether knee_gap can use it."""
+"""Summary of the topics of a bag, and the check whether knee_gap can process it."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,14 +11,14 @@ from knee_gap_core.bag.errors import BagError
 from knee_gap_replay.topics import InputTopics
 
 _SECOND_NS = 1e9
-# Lens poses on either side of an image may lie this far from its stamp [ns]: max_pose_age of the estimator.
+# Largest time between an image and the lens poses before and after it [ns]: max_pose_age of the estimator.
 _MOST_POSE_AGE_NS = 25_000_000
 _ENOUGH = 0.9
 
 
 @dataclass
 class TopicCheck:
-    """What was seen on one topic; times [ns] in the order of the bag."""
+    """Messages of one topic: their type and times [ns], in the order of the bag."""
 
     name: str
     msgtype: str
@@ -28,18 +28,18 @@ class TopicCheck:
 
     @property
     def times_ns(self) -> npt.NDArray[np.int64]:
-        """Stamps where the messages have them, else times of recording."""
+        """Header stamps if the messages have them, else recording times."""
         return np.asarray(self.stamp_ns or self.record_ns, dtype=np.int64)
 
     @property
     def rate(self) -> float:
-        """Messages a second by the median distance [Hz]; NaN below two messages."""
+        """Message rate from the median interval [Hz]; NaN for fewer than two messages."""
         steps = np.diff(self.times_ns)
         steps = steps[steps > 0]
         return float(_SECOND_NS / np.median(steps)) if steps.size else float("nan")
 
     def remarks(self) -> Iterator[str]:
-        """Yield what a user should know of the topic, in a few words each."""
+        """Yield short remarks on the topic: gaps, stamps out of order, latency, unreadable messages."""
         steps = np.diff(self.times_ns)
         period = _SECOND_NS / self.rate
         if (gaps := steps[steps > 1.5 * period]).size:
@@ -56,7 +56,7 @@ class TopicCheck:
 
 
 def check_topics(reader: BagReader) -> dict[str, TopicCheck]:
-    """Read the whole bag; return what was seen by topic."""
+    """Return a summary of each topic, from the whole bag."""
     checks = {name: TopicCheck(name, msgtype) for name, msgtype in sorted(reader.topics.items())}
     for message in reader.messages():
         check = checks[message.topic]
@@ -81,19 +81,21 @@ def _check_message(reader: BagReader, message: BagMessage, check: TopicCheck) ->
 
 
 def reasons_against(checks: Mapping[str, TopicCheck], topics: InputTopics) -> list[str]:
-    """Return why knee_gap cannot use a bag with these topics: a few words each, none if it can."""
+    """Return the reasons why knee_gap cannot process a bag with these topics; empty if it can."""
     usable = {name for name, check in checks.items() if check.record_ns and not check.unreadable}
-    reasons = [f"nothing readable on {name}" for name in topics if name not in usable]
+    reasons = [f"no readable message on {name}" for name in topics if name not in usable]
     if topics.image in usable and topics.body_pose in usable:
         share = _share_between_poses(checks[topics.image].times_ns, checks[topics.body_pose].times_ns)
         if share < _ENOUGH:
             most_ms = _MOST_POSE_AGE_NS * 1e-6
-            reasons.append(f"only {share:.0%} of the images lie between poses at most {most_ms:.0f} ms away")
+            reasons.append(
+                f"only {share:.0%} of the images have poses within {most_ms:.0f} ms before and after them"
+            )
     return reasons
 
 
 def _share_between_poses(images_ns: npt.NDArray[np.int64], poses_ns: npt.NDArray[np.int64]) -> float:
-    """Share of images that lie between two poses, neither further away than an estimate allows."""
+    """Fraction of images with a pose before and a pose after them, both recent enough for an estimate."""
     poses_ns = np.sort(poses_ns)
     after = np.searchsorted(poses_ns, images_ns)
     before = np.searchsorted(poses_ns, images_ns, side="right") - 1

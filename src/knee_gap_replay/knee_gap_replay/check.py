@@ -1,4 +1,4 @@
-"""Tells what a bag holds, what is damaged, and whether knee_gap can use it."""
+"""The command `check`: contents of a bag, its damage, and whether knee_gap can process it."""
 
 import argparse
 import sys
@@ -39,7 +39,7 @@ def _parser() -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Check a bag; 0 if it can be used."""
+    """Check a bag; return 0 if it can be used."""
     return run(_parser(), _run, argv)
 
 

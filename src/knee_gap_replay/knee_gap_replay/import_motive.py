@@ -1,8 +1,8 @@
-"""Turns a take that Motive exported as CSV into a bag of poses, beside a video or another bag in time.
+"""Conversion of a Motive take (CSV export) to a bag of poses, aligned in time with a video or another bag.
 
-Frames in which the body was not seen are left out: a gap in the bag is what tracking_node takes for one. Time
-zero of the take is its capture start (by the clock of Motive's machine, taken as UTC), or --start, or the
-first message of the bag given with --align; --offset is added.
+Frames in which the body was not tracked are left out; tracking_node treats the gap in the bag as a drop-out.
+Time zero of the take is its capture start (by the clock of Motive's machine, taken as UTC), or --start, or
+the first message of the bag given with --align. --offset is added.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from knee_gap_perception.trackers.motive_csv import Take, TakeBody, read_take
 from knee_gap_perception.trackers.up_axis import UP_AXES
 from knee_gap_replay.topics import namespace_from
 
-# Stamps of ROS count seconds in 31 bits.
+# ROS stamps count seconds in 31 bits.
 _END_OF_STAMPS = 1 << 31
 POSE = "geometry_msgs/msg/PoseStamped"
 
@@ -29,7 +29,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 def write_take(
     take: Take, bodies: Sequence[tuple[str, TakeBody]], writer: BagWriter, start_ns: int
 ) -> list[int]:
-    """Write bodies to their topics, in the order of the frames; return how many poses each has."""
+    """Write bodies to their topics in the order of the frames; return the number of poses of each."""
     for topic, _ in bodies:
         writer.add_topic(topic, POSE, "sensor")
     seen = [body.seen for _, body in bodies]
@@ -62,9 +62,7 @@ def _start_ns(take: Take, arguments: argparse.Namespace) -> int:
     elif take.start is not None:
         start = round(take.start.timestamp() * 1000) * 1_000_000
     else:
-        raise BagError(
-            f"the take's start '{take.start_text}' cannot be read; say when it was with --start or --align"
-        )
+        raise BagError(f"the take's start '{take.start_text}' cannot be read; set it with --start or --align")
     start += round(arguments.offset * NANOSECONDS)
     if start < 0:
         before = f"{-start / NANOSECONDS:.3f} s before 1970"
@@ -75,7 +73,7 @@ def _start_ns(take: Take, arguments: argparse.Namespace) -> int:
 
 
 def _first_stamp_ns(bag: str, topic: str | None) -> int:
-    """Stamp of a bag's first message, or when it was recorded where it has none."""
+    """Stamp of a bag's first message, or its recording time if it has none."""
     with BagReader(bag) as reader:
         first = next(iter(reader.messages(None if topic is None else [topic])), None)
         if first is None:
@@ -96,7 +94,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except PerceptionError as error:
         raise BagError(str(error)) from None
     if not any(body.seen.any() for _, body in bodies[:1]):
-        raise BagError(f"{arguments.take}: the body '{arguments.body}' is not seen in any frame")
+        raise BagError(f"{arguments.take}: the body '{arguments.body}' is not tracked in any frame")
     start_ns = _start_ns(take, arguments)
     metadata = {"take": Path(arguments.take).name, "take_format": take.version, "take_start": take.start_text}
     with BagWriter(arguments.out, metadata=metadata) as writer:
@@ -104,7 +102,8 @@ def _run(arguments: argparse.Namespace) -> int:
     frames = len(take.time)
     if take.exported_count not in (None, frames):
         print(
-            f"import_motive: the file says {take.exported_count} frames and holds {frames}", file=sys.stderr
+            f"import_motive: {take.exported_count} frames by the header, {frames} in the file",
+            file=sys.stderr,
         )
     summary = ", ".join(
         f"{count} of '{body.name}' on {topic}" for count, (topic, body) in zip(counts, bodies, strict=True)
@@ -115,23 +114,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _parser() -> Parser:
     parser = Parser(prog="import_motive", description=__doc__)
-    parser.add_argument("take", metavar="TAKE.csv", help="export of Motive, format 1.20 to 1.25")
+    parser.add_argument("take", metavar="TAKE.csv", help="CSV export of Motive, format 1.20 to 1.25")
     parser.add_argument("body", metavar="BODY", help="name or id of the scope's rigid body")
     parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
     parser.add_argument(
-        "--reference", metavar="BODY", help="rigid body of the leg, to NAMESPACE/reference_body/pose"
+        "--reference", metavar="BODY", help="rigid body of the leg, written to NAMESPACE/reference_body/pose"
     )
-    parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="of the topics (/knee_gap)")
-    parser.add_argument("--topic", help="of the scope's poses (NAMESPACE/scope_body/pose)")
+    parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="namespace (/knee_gap)")
+    parser.add_argument("--topic", help="topic of the scope's poses (NAMESPACE/scope_body/pose)")
     parser.add_argument("--up-axis", choices=UP_AXES, default="y", help="axis that points up in the take (y)")
-    parser.add_argument("--offset", type=finite, default=0.0, metavar="S", help="to add to stamps [s] (0)")
+    parser.add_argument("--offset", type=finite, default=0.0, metavar="S", help="added to the stamps [s] (0)")
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         "--start", type=not_negative, metavar="S", help="time of the take's start since 1970 [s]"
     )
     start.add_argument("--align", metavar="BAG", help="bag whose first message is the take's start")
-    parser.add_argument("--align-topic", metavar="TOPIC", help="of that bag, where its first message counts")
-    parser.add_argument("--partial", action="store_true", help="read what there is of a file that was cut")
+    parser.add_argument("--align-topic", metavar="TOPIC", help="use the first message on this topic")
+    parser.add_argument("--partial", action="store_true", help="read a truncated file as far as it goes")
     return parser
 
 

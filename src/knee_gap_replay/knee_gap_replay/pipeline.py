@@ -1,6 +1,6 @@
-"""The cores of the three live nodes in one pipeline: images, camera and tracked body in, the gap out.
+"""The cores of the three live nodes in one pipeline: images, camera and body poses in, gap estimates out.
 
-What passes from core to core passes as messages, as it does between the nodes.
+The cores exchange messages, as the nodes do.
 """
 
 import logging
@@ -67,18 +67,18 @@ PARAMETERS: dict[str, tuple[type, ...]] = {
 
 
 class GapPipeline:
-    """Feeds the cores in the order of stamps; `space` is the namespace of what it publishes.
+    """Feeds the cores in the order of stamps; `space` is the namespace of the published topics.
 
-    `with_mask` publishes the mask of the gap in every image as well, which the node makes for listeners only.
+    `with_mask` publishes the gap mask of every image as well; the node does so only if there are subscribers.
     """
 
     @classmethod
     def from_parameters(
         cls, file: ParametersFile, topics: InputTopics, space: str, *, with_mask: bool = False
     ) -> Self:
-        """Return a pipeline of cores with the parameters of the nodes in `file`; `with_mask` as for itself.
+        """Return a pipeline of cores with the node parameters in `file`; `with_mask` as in the constructor.
 
-        Raises BagError for parameters that no core has or that one refuses.
+        Raises BagError for unknown parameters and for values that a core refuses.
         """
         file.refuse_unknown(PARAMETERS)
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
@@ -130,7 +130,7 @@ class GapPipeline:
     ) -> None:
         self._detector = detector
         self._tracker = tracker
-        # A bag holds topics; what came straight from Motive was recorded as the pose of the lens.
+        # A bag contains topics only; poses received from Motive directly were recorded as poses of the lens.
         self._body_names = {topics.body_pose: SCOPE}
         for name, topic in tracker.parameters.other_bodies.items():
             self._body_names[f"{space}/{topic}"] = name
@@ -139,7 +139,7 @@ class GapPipeline:
         self._topics = topics
         self._space = space
         self._with_mask = with_mask
-        # What the nodes say of their calibrations at their start; in a bag only where there is one.
+        # Calibrations that the nodes publish at their start; in a bag only if there is one.
         used = {"segmentation_node": detector.calibration, "tracking_node": tracker.calibration}
         self._calibrations = [
             fill_scope_calibration(
@@ -152,13 +152,13 @@ class GapPipeline:
             for node, calibration in used.items()
             if any(used.values())
         ]
-        # As in the nodes: what a core raises refuses one message, and that core starts afresh.
+        # As in the nodes: an exception rejects one message, and that core starts again.
         self._seam = Seam(self._log_fault)
         self._newest_stamp_ns: int | None = None
-        # The estimator's clock: it follows the stamps, and stands still where they run backwards.
+        # The estimator's clock: it follows the stamps, and stands still while they run backwards.
         self._now_ns = 0
         self._leg_body = [f"{space}/leg_body/pose"] if estimator.parameters.leg_motion > 0.0 else []
-        # Before an image comes the camera's model, and the pose of the same instant.
+        # Among equal stamps, the camera model and the pose come before the image.
         bodies = (*self._leg_body, *self._body_names)
         self.inputs: Sequence[str] = (topics.camera_info, *bodies, topics.image)
         self.outputs: Mapping[str, tuple[str, QosName]] = {
@@ -188,13 +188,13 @@ class GapPipeline:
             self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
-        """Take an image, a camera model or a pose of the tracked body; return what is published then."""
+        """Process an image, a camera model or a pose of the tracked body; return the messages published."""
         if self._newest_stamp_ns is not None:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
         else:
             yield from self._reported_calibrations(stamp_ns)
         self._newest_stamp_ns = stamp_ns
-        # Before the message is taken: what it could not wait for any longer is without it, as live.
+        # Before the message is processed: images whose wait is over go on without it, as live.
         yield from self._looked_at(self._detector.ready(self._now_ns))
         yield from self._estimated("time", lambda: self._estimator.advance(self._now_ns))
         yield from self._advice()
@@ -213,16 +213,16 @@ class GapPipeline:
         yield from self._looked_at(self._detector.ready(self._now_ns))
 
     def flaws(self) -> list[str]:
-        """What about the calibration kept all results from being valid, and what raised, a line each."""
+        """Faults, one line each: those of the calibration that make all results invalid, and exceptions."""
         size = self._detector.size_flaw
         faults = [f"{count} times {fault}" for fault, count in self._seam.counts.items()]
         return [flaw for flaw in (self._estimator.calibration_flaw, size, *faults) if flaw]
 
     def finish(self) -> Iterable[Output]:
-        """Return the edges and estimates of images whose lens pose will not come any more."""
+        """Return the edges and estimates of images that are still waiting for their lens pose."""
         faults = -1
         while faults < self._seam.counts.total():
-            # Again where an image raised, for those behind it.
+            # Repeated if an image raised, for the images after it.
             faults = self._seam.counts.total()
             yield from self._looked_at(self._detector.finish())
         wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
@@ -288,12 +288,12 @@ class GapPipeline:
         return self._estimator.add_edges(messages.edges_from_message(edges), self._now_ns)
 
     def _estimated(self, what: str, call: Callable[[], list[GapEstimate]]) -> Iterator[Output]:
-        """What the estimator answers."""
+        """Return the estimator's messages."""
         answer = self._seam.call(what, lambda fault: self._estimator.recover(fault.reason), call)
         return self._published(answer)
 
     def _segmented(self, what: str, call: Callable[[], None]) -> Iterator[Output]:
-        """Hand something to the edge stream; what follows is empty unless it raises."""
+        """Pass an input to the edge stream; return the messages published because of an exception, if any."""
 
         def nothing() -> list[GapEdges]:
             call()

@@ -1,4 +1,4 @@
-"""Plays a bag onto ROS topics, byte for byte."""
+"""The command `play`: a bag published on ROS topics, byte for byte."""
 
 import argparse
 import logging
@@ -35,15 +35,15 @@ from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, requir
 from knee_gap_replay.playback import Event, Pace, Played, play_once, with_clock, without_clock
 
 _LOG = logging.getLogger(__name__)
-# Two seconds of a tracker, four of images: what a reliable subscriber may fall behind without loss. It is
-# held only while somebody is behind.
+# Two seconds of a tracker, four of images: how far a reliable subscriber may fall behind without loss. The
+# memory is used only while a subscriber is behind.
 _DEPTH = 256
 _SETTLE_SECONDS = 0.2
 _ACKNOWLEDGE_SECONDS = 2.0
 
 
 class PlayNode(GuardedNode):
-    """Publishers for the topics of a bag; skips, with one line each, what this machine has no type for."""
+    """Publishers for the topics of a bag. Topics of unknown types are skipped with one line each."""
 
     def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:
         with refused_by_ros():
@@ -56,16 +56,16 @@ class PlayNode(GuardedNode):
             except BagError as error:
                 _LOG.warning("%s is not played: %s", name, error)
         if not self._publishers_by_topic:
-            raise BagError(f"{reader.path} has no topic that can be played here")
+            raise BagError(f"{reader.path} has no topic that can be played")
         self._clock_publisher = self.create_publisher(Clock, "/clock", 10) if clock else None
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The topics that are played."""
+        """Topics that are played."""
         return tuple(self._publishers_by_topic)
 
     def emit(self, event: Event) -> None:
-        """Publish a message as it stands in the bag, or the bag's time."""
+        """Publish a message unchanged, or the bag's time."""
         if event.message is not None:
             self._publishers_by_topic[event.message.topic].publish(event.message.data)
         elif self._clock_publisher is not None:
@@ -73,18 +73,18 @@ class PlayNode(GuardedNode):
             self._clock_publisher.publish(Clock(clock=now.to_msg()))
 
     def wait_for_subscribers(self, topics: Collection[str], seconds: float, stop: threading.Event) -> None:
-        """Return once each of `topics` has a subscriber; raises BagError where one has none in time."""
+        """Return once each of `topics` has a subscriber. Raises BagError if one has none in time."""
         deadline = time.monotonic() + seconds
         while waiting := [t for t in topics if not self._publishers_by_topic[t].get_subscription_count()]:
             if time.monotonic() > deadline:
-                raise BagError(f"nobody subscribed to {', '.join(waiting)} within {seconds:g} s")
+                raise BagError(f"no subscriber to {', '.join(waiting)} within {seconds:g} s")
             if stop.wait(0.02):
                 return
-        # A match is seen on this side first; the other side needs a moment to see it too.
+        # The publisher discovers a match first; the subscriber needs a moment to discover it too.
         stop.wait(_SETTLE_SECONDS)
 
     def flush(self) -> None:
-        """Return when subscribers have what was published, or cannot be waited for any longer."""
+        """Return when all subscribers have acknowledged the messages, or after a timeout."""
         for publisher in self._publishers_by_topic.values():
             publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_SECONDS))
         time.sleep(_SETTLE_SECONDS)
@@ -100,7 +100,7 @@ class PlayNode(GuardedNode):
 
 
 def _offered(topic: Topic) -> QoSProfile:
-    """Return what a replay offers: always reliable, which best-effort subscribers can use as well."""
+    """Return the quality of service of a replay: always reliable, which suits best-effort subscribers too."""
     latched = qos_profiles.is_latched(topic.qos)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
@@ -111,7 +111,7 @@ def _offered(topic: Topic) -> QoSProfile:
 
 
 def _play(node: PlayNode, reader: BagReader, arguments: argparse.Namespace, stop: threading.Event) -> Played:
-    """Play once, or over and over, until done or stopped."""
+    """Play once, or in a loop until stopped."""
     begin_ns = time.monotonic_ns()
     count = latest_ns = 0
     while True:
@@ -131,7 +131,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if reader.renamed:
             print(f"play: {reader.renamed}", flush=True)
         chosen = frozenset(arguments.topics or reader.topics)
-        reader.messages([*chosen, *arguments.wait_for])  # refuses a topic that the bag does not have
+        reader.messages([*chosen, *arguments.wait_for])  # raises for a topic that is not in the bag
         stop = stop_on_signals()
         node = PlayNode(reader, chosen, clock=arguments.clock)
         try:
@@ -158,15 +158,15 @@ def _parser() -> Parser:
     parser.add_argument("bag", metavar="BAG", help="bag folder or .mcap file")
     parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="times as fast as recorded")
     parser.add_argument(
-        "--loop", action="store_true", help="begin again at the end; header stamps then jump back"
+        "--loop", action="store_true", help="start again at the end; header stamps then jump back"
     )
     parser.add_argument("--clock", action="store_true", help="publish the bag's time on /clock, at 100 Hz")
-    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play these only")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these topics")
     parser.add_argument(
-        "--delay", type=not_negative, default=0.0, metavar="SECONDS", help="wait before the first"
+        "--delay", type=not_negative, default=0.0, metavar="SECONDS", help="wait before the first message"
     )
     parser.add_argument(
-        "--wait-for", nargs="+", default=[], metavar="TOPIC", help="begin when each of these has a subscriber"
+        "--wait-for", nargs="+", default=[], metavar="TOPIC", help="start when each of these has a subscriber"
     )
     parser.add_argument(
         "--wait-timeout", type=positive, default=30.0, metavar="SECONDS", help="how long --wait-for waits"
@@ -175,7 +175,7 @@ def _parser() -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Play a bag; ROS arguments (--ros-args) are understood as by any node."""
+    """Play a bag; takes ROS arguments (--ros-args) like any node."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
         require_files(given)

@@ -1,4 +1,4 @@
-"""When each message of a bag is due: absolute deadlines, so that delays never add up."""
+"""Due times of the messages of a bag: absolute deadlines, so that delays do not add up."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class Event(NamedTuple):
 
 
 def with_clock(messages: Iterable[BagMessage], period_ns: int = CLOCK_PERIOD_NS) -> Iterator[Event]:
-    """Yield the messages, and before each the ticks since the one before, so that the clock never lags it."""
+    """Yield the messages, each after the clock ticks up to its time, so that the clock is never behind it."""
     tick_ns: int | None = None
     for message in messages:
         tick_ns = message.time_ns if tick_ns is None else tick_ns
@@ -48,7 +48,7 @@ class Pace:
 
 
 class Played(NamedTuple):
-    """What one pass published, how late at worst, and when on the caller's clock it ended."""
+    """Result of one pass: number of messages, largest delay, and end time on the caller's clock."""
 
     message_count: int
     latest_ns: int
@@ -62,9 +62,9 @@ def play_once(
     now_ns: Callable[[], int],
     wait: Callable[[float], bool],
 ) -> Played:
-    """Emit every event when it is due, none early and none left out; late ones at once.
+    """Emit every event at its due time, or at once if it is late. No event is early or dropped.
 
-    `wait(seconds)` returns True when playing shall stop.
+    `wait(seconds)` returns True if playing is to stop.
     """
     count = latest_ns = end_ns = 0
     for event in events:

@@ -1,7 +1,6 @@
-"""Processes a bag into a bag of results: the cores of the live nodes, without ROS.
+"""The command `process`: a bag of results from a bag of inputs, by the cores of the live nodes, without ROS.
 
-Images, camera model and poses are taken by their stamps, none is dropped, and the same bag gives the same
-bytes.
+Messages are processed in the order of their stamps, none is dropped, and the same bag gives the same bytes.
 """
 
 import argparse
@@ -16,12 +15,12 @@ from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
 
-# What a bag may have beside it: the calibration of its scope, or the parameters that fit it.
+# Files that a bag folder may contain: the calibration of its scope, or parameters for its scope.
 _CALIBRATION, _BESIDE = "calibration.yaml", "scope.yaml"
 
 
 def _parameters(arguments: argparse.Namespace) -> ParametersFile:
-    """The parameters of the file that is named, or of what lies beside the bag."""
+    """Parameters from the named file, else from the files in the bag folder."""
     if arguments.params_file is not None:
         return ParametersFile(Path(arguments.params_file))
     bag = Path(arguments.bag)
@@ -40,7 +39,7 @@ def _run(arguments: argparse.Namespace) -> int:
         pipeline = GapPipeline.from_parameters(
             parameters, topics, namespace_from(arguments), with_mask=arguments.gap_mask
         )
-        reader.messages(pipeline.inputs)  # refuses a bag without them before anything is written
+        reader.messages(pipeline.inputs)  # raises for a bag without them before anything is written
         with BagWriter(arguments.out, metadata=reader.metadata) as writer:
             counts = process(reader, writer, pipeline)
     for flaw in pipeline.flaws():
@@ -61,7 +60,7 @@ def _parser() -> Parser:
         f"its {_BESIDE}",
     )
     parser.add_argument(
-        "--gap-mask", action="store_true", help="write the mask of the gap in every image as well (gap_mask)"
+        "--gap-mask", action="store_true", help="write the gap mask of every image as well (gap_mask)"
     )
     add_topic_arguments(parser)
     return parser

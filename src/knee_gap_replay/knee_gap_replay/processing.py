@@ -1,6 +1,6 @@
-"""Processes a bag into a bag of results: the cores of the live nodes, without ROS and without a clock.
+"""Offline processing of a bag by a pipeline, without ROS and without a clock.
 
-Messages are fed by their header's stamp, none is dropped, and the same bag gives the same bytes.
+Messages are fed in the order of their header stamps, none is dropped, and the same bag gives the same bytes.
 """
 
 import heapq
@@ -16,17 +16,17 @@ from knee_gap_core.node.command_line import with_progress
 
 _LOG = logging.getLogger(__name__)
 
-# No driver keeps a message back longer than this [ns]; within it, messages are put in order of their stamps.
+# Largest latency of a driver [ns]: within it, messages are sorted by their stamps.
 MOST_LATENCY_NS = 500_000_000
-# Stamps of two topics this far apart are of two clocks [ns]: one since boot, or without a date.
+# Stamps of two topics at least this far apart are of different clocks [ns]: one counts since boot, say.
 _OTHER_CLOCK_NS = 3_600 * 1_000_000_000
-# By so many messages a topic's clock is known, looked for in so long a part of the bag [ns].
+# Messages needed to determine a topic's clock, and the length of the part of the bag that is searched [ns].
 _ENOUGH_MESSAGES = 20
 _CLOCK_SEARCH_NS = 30 * 1_000_000_000
 
 
 class Output(NamedTuple):
-    """A message that a pipeline publishes, and the stamp that it belongs to [ns]."""
+    """A message published by a pipeline, and its stamp [ns]."""
 
     topic: str
     message: Any
@@ -34,9 +34,9 @@ class Output(NamedTuple):
 
 
 class Pipeline(Protocol):
-    """What turns messages, in the order of their stamps, into results.
+    """Interface of a processor: messages in the order of their stamps in, results out.
 
-    `inputs` are the topics it needs; of messages with the same stamp, those of the first come first.
+    `inputs` are the topics it needs; among messages of the same stamp, those of earlier topics come first.
     `outputs` are the topics it publishes, with their types and quality of service.
     """
 
@@ -49,16 +49,16 @@ class Pipeline(Protocol):
         """Type and quality of service of each topic."""
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
-        """Take one message and return what follows from it."""
+        """Process one message; return the results."""
 
     def finish(self) -> Iterable[Output]:
-        """Return what was still waiting for more."""
+        """Return the results that were still waiting for more input."""
 
 
 class Stamped(NamedTuple):
-    """A message in the order of stamps; among equal stamps, by the rank of its topic, then as recorded.
+    """A message with its sorting key: stamp, then rank of its topic, then position in the bag.
 
-    `stamp_ns` is the header's, by the clock of the other topics where the topic has one of its own.
+    `stamp_ns` is the header's stamp, converted to the clock of the other topics if its topic has another.
     """
 
     stamp_ns: int
@@ -68,10 +68,10 @@ class Stamped(NamedTuple):
 
 
 def by_stamp(reader: BagReader, topics: Sequence[str]) -> Iterator[Stamped]:
-    """Yield the messages of `topics` by their stamps.
+    """Yield the messages of `topics` in the order of their stamps.
 
-    Where the stamps of a topic run backwards (a recorded loop), what came before is yielded first. A topic
-    whose stamps are of another clock is put where it was recorded, as it came to the live nodes.
+    If the stamps of a topic run backwards (a recorded loop), the messages before that are yielded first. A
+    topic whose stamps are of another clock is ordered by its recording times, as it was received live.
     """
     shifts = _shifts(reader, topics)
     rank = {topic: index for index, topic in enumerate(topics)}
@@ -95,7 +95,7 @@ def by_stamp(reader: BagReader, topics: Sequence[str]) -> Iterator[Stamped]:
 
 
 def _shifts(reader: BagReader, topics: Sequence[str]) -> dict[str, int]:
-    """What to add to the stamps of each topic of another clock than the first's [ns]; none for the same."""
+    """Offset to add to the stamps of each topic whose clock differs from the first topic's [ns]."""
     ahead: dict[str, list[int]] = {topic: [] for topic in topics}
     begin_ns: int | None = None
     for message in reader.messages(topics):
@@ -106,7 +106,7 @@ def _shifts(reader: BagReader, topics: Sequence[str]) -> dict[str, int]:
         enough = all(len(known) >= _ENOUGH_MESSAGES for known in ahead.values())
         if enough or message.time_ns - begin_ns > _CLOCK_SEARCH_NS:
             break
-    # A median: drivers stamp their first message with 0.
+    # The median, since some drivers stamp their first message with 0.
     clocks = {topic: statistics.median_low(known) for topic, known in ahead.items() if known}
     reference = next(iter(clocks.values()), 0)
     shifts = {topic: reference - clock for topic, clock in clocks.items()}
@@ -114,10 +114,10 @@ def _shifts(reader: BagReader, topics: Sequence[str]) -> dict[str, int]:
 
 
 def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[str, int]:
-    """Run a bag through a pipeline and write what it publishes; return the number of messages by topic.
+    """Process a bag with a pipeline and write the results; return the number of messages by topic.
 
-    A message that cannot be read is told in one line and left out. Raises BagError where the bag lacks
-    a topic that the pipeline needs.
+    A message that cannot be read is reported in one line and skipped. Raises BagError if the bag lacks a
+    topic that the pipeline needs.
     """
     if missing := [topic for topic in pipeline.inputs if topic not in reader.topics]:
         names = ", ".join(sorted(reader.topics)) or "none"
@@ -137,5 +137,5 @@ def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[st
 
 def _write(writer: BagWriter, outputs: Iterable[Output]) -> None:
     for topic, message, stamp_ns in outputs:
-        # Not the time of writing, so that the same bag gives the same bytes.
+        # Not the present time, so that the same bag gives the same bytes.
         writer.write(topic, message, stamp_ns)

@@ -1,4 +1,4 @@
-"""Records ROS topics into a bag, byte for byte."""
+"""The command `record`: ROS topics written to a bag, byte for byte."""
 
 import argparse
 import logging
@@ -30,13 +30,13 @@ from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, requir
 from knee_gap_replay.recording import WriterThread
 
 _LOG = logging.getLogger(__name__)
-# One second of a tracker at 240 Hz, four of images: how long a busy machine may keep the recorder away.
+# One second of a tracker at 240 Hz, four of images: how long the recorder may be stalled on a busy machine.
 _DEPTH = 256
 _LOOK_SECONDS = 0.02
 
 
 class RecordNode(GuardedNode):
-    """Subscribes to each topic once somebody publishes it, as weakly as its weakest publisher offers."""
+    """Subscribes to each topic once it is published, with the quality of service of its weakest publisher."""
 
     def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
         with refused_by_ros():
@@ -54,11 +54,11 @@ class RecordNode(GuardedNode):
 
     @property
     def silent_topics(self) -> list[str]:
-        """Topics that nobody has published so far."""
+        """Topics without a publisher so far."""
         return [topic for topic in self._wanted if topic not in self._last_numbers]
 
     def look_for_publishers(self) -> None:
-        """Subscribe to what has appeared; anew where a publisher offers less than the ones before."""
+        """Subscribe to new topics; subscribe again if a new publisher offers a weaker quality of service."""
         for topic in self._wanted:
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers or topic in self._refused:
@@ -67,7 +67,7 @@ class RecordNode(GuardedNode):
             if (known := self._profiles.get(topic)) is not None:
                 if known == profile or known.reliability == ReliabilityPolicy.BEST_EFFORT:
                     continue
-                _LOG.warning("%s has a publisher that offers less than the others; subscribing anew", topic)
+                _LOG.warning("%s has a publisher of weaker quality of service; subscribing again", topic)
                 self.destroy_subscription(self._subscriptions_by_topic[topic])
             try:
                 self._subscribe(topic, publishers, profile)
@@ -101,7 +101,7 @@ class RecordNode(GuardedNode):
         self._writer.put(BagMessage(topic, msgtype, received, data))
 
     def _count_lost(self, topic: str, number: int | None) -> None:
-        """Count the numbers left out by a topic's only publisher; several publishers each have their own."""
+        """Count missing sequence numbers of a topic's only publisher; each publisher has its own sequence."""
         if number is None:
             return
         last = self._last_numbers.get(topic)
@@ -111,7 +111,7 @@ class RecordNode(GuardedNode):
 
 
 def _weakest(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
-    """Return the strongest request that every publisher satisfies."""
+    """Return the strongest quality of service that every publisher satisfies."""
     reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
     latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return QoSProfile(
@@ -123,7 +123,7 @@ def _weakest(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
 
 
 def _offered(publisher: TopicEndpointInfo) -> Qos:
-    """Return what a publisher offers, for the bag; the depth of its history is not told over the network."""
+    """Return a publisher's quality of service for the bag; DDS does not report the depth of its history."""
     profile = publisher.qos_profile
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     reliable = profile.reliability == ReliabilityPolicy.RELIABLE
@@ -157,7 +157,7 @@ def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) ->
         raise BagError(f"{out}: {writer.error}")
     counts = bag.counts
     for topic in node.silent_topics:
-        _LOG.warning("nothing was received on %s", topic)
+        _LOG.warning("no message was received on %s", topic)
     lost = node.lost + writer.dropped
     for topic, count in sorted(lost.items()):
         _LOG.warning("%d messages of %s were lost", count, topic)
@@ -173,12 +173,12 @@ def _parser() -> Parser:
     parser.add_argument(
         "topics", nargs="+", metavar="TOPIC", help="topics to record, once they are published"
     )
-    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="stop after so long")
+    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="stop after this time")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Record topics until SIGINT or SIGTERM; ROS arguments (--ros-args) are understood as by any node."""
+    """Record topics until SIGINT or SIGTERM; takes ROS arguments (--ros-args) like any node."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
         require_files(given)

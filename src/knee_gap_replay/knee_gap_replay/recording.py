@@ -1,4 +1,4 @@
-"""Writes a bag beside the thread that receives, so that a slow disk delays no message."""
+"""Bag writer in a thread of its own, so that a slow disk does not delay the receiving thread."""
 
 import queue
 import threading
@@ -10,17 +10,17 @@ from rosbags.interfaces import Qos
 
 from knee_gap_core.bag.bag import BagMessage, BagWriter
 
-# How much a recorder that is killed loses at most.
+# Most data that is lost if the recorder is killed.
 _FLUSH_SECONDS = 0.5
 # Some seconds of raw video.
 _MEMORY_BYTES = 512 * 1024 * 1024
 
 
 class WriterThread(threading.Thread):
-    """Takes messages without waiting and writes them in the order in which they came.
+    """Queues messages without blocking and writes them in the order of arrival.
 
-    A message that comes while the memory for waiting ones is full is dropped and counted in `dropped`. A
-    failure to write ends the thread and stands in `error`.
+    A message that arrives while the queue is full is dropped and counted in `dropped`. A failure to write
+    ends the thread and is kept in `error`.
     """
 
     def __init__(self, bag: BagWriter, memory_bytes: int = _MEMORY_BYTES) -> None:
@@ -35,11 +35,11 @@ class WriterThread(threading.Thread):
         )
 
     def add_topic(self, name: str, msgtype: str, qos: Sequence[Qos]) -> None:
-        """Announce a topic, before its messages."""
+        """Declare a topic, before its messages."""
         self._queue.put((name, msgtype, qos))
 
     def put(self, message: BagMessage) -> None:
-        """Take a message; returns at once."""
+        """Queue a message; returns at once."""
         if self._put_bytes - self._written_bytes + len(message.data) > self._memory_bytes:
             self.dropped[message.topic] += 1
             return
@@ -47,7 +47,7 @@ class WriterThread(threading.Thread):
         self._queue.put(message)
 
     def finish(self) -> None:
-        """Return when everything taken is written."""
+        """Return when all queued messages are written."""
         self._queue.put(None)
         self.join()
 
@@ -55,7 +55,7 @@ class WriterThread(threading.Thread):
         """Write until `finish`."""
         try:
             self._write()
-        except Exception as error:  # told by the command, which then stops
+        except Exception as error:  # reported by the command, which then stops
             self.error = error
 
     def _write(self) -> None:

@@ -1,4 +1,4 @@
-"""The topics of knee_gap in a bag."""
+"""Names of knee_gap's input topics in a bag, and the command line arguments that set them."""
 
 import argparse
 from collections.abc import Collection
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class InputTopics(NamedTuple):
-    """Where the inputs are."""
+    """Names of the input topics."""
 
     image: str
     camera_info: str
@@ -14,19 +14,19 @@ class InputTopics(NamedTuple):
 
 
 def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that say under which names a bag has the inputs."""
-    parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="of the topics (/knee_gap)")
+    """Add the arguments that set the names of the input topics."""
+    parser.add_argument("--namespace", default="/knee_gap", metavar="NAME", help="namespace (/knee_gap)")
     parser.add_argument(
         "--image", metavar="TOPIC", help="images (NAMESPACE/image_raw/compressed, or image_raw)"
     )
     parser.add_argument("--camera-info", metavar="TOPIC", help="camera model (NAMESPACE/camera_info)")
     parser.add_argument(
-        "--pose", metavar="TOPIC", help="tracked body of the scope (NAMESPACE/scope_body/pose)"
+        "--pose", metavar="TOPIC", help="pose of the scope's tracked body (NAMESPACE/scope_body/pose)"
     )
 
 
 def topics_from(arguments: argparse.Namespace, available: Collection[str]) -> InputTopics:
-    """Return the topics that the arguments name; of compressed and raw images, those that are `available`."""
+    """Return the topics that the arguments name; of compressed and raw images, the `available` topic."""
     space = namespace_from(arguments)
     compressed, raw = f"{space}/image_raw/compressed", f"{space}/image_raw"
     return InputTopics(
@@ -37,6 +37,6 @@ def topics_from(arguments: argparse.Namespace, available: Collection[str]) -> In
 
 
 def namespace_from(arguments: argparse.Namespace) -> str:
-    """Return the namespace with one leading slash and none behind, empty for the root."""
+    """Return the namespace with a leading and without a trailing slash; empty for the root."""
     name = str(arguments.namespace).strip("/")
     return f"/{name}" if name else ""

@@ -1,1 +1,1 @@
-"""A knee whose gap is known, the scope that looks at it and the tracker that follows the scope."""
+"""Simulated knees of known gap, with a simulated arthroscope and tracker."""

@@ -1,4 +1,4 @@
-"""`contact_sheet`: the knee at levels 0 to 3 in one picture, beside real frames where there are any."""
+"""The command `contact_sheet`: one picture of the knee at levels 0 to 3, with real frames if given."""
 
 import sys
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from knee_gap_simulation.scope.imaging import ByteImage
 
 _SIZE_PX = 400
 _LABEL_PX = 34
-# Seconds into each level's recording: the probe is there at some, and away at others.
+# Times in each level's recording [s]: the probe is visible at some and away at others.
 _MOST_PICTURE_BYTES = 64 << 20
 _MOST_FRAMES = 128
 _MOMENTS_S = (1.0, 2.2, 3.0, 1.4)
 
 
 def contact_sheet(seeds: Sequence[int], real: Sequence[ByteImage] = ()) -> ByteImage:
-    """One row of levels 0 to 3 for each seed, and rows of real frames (h, w, 3) below."""
+    """Picture with one row of levels 0 to 3 for each seed, and rows of real frames (h, w, 3) below."""
     rows = [_label([f"level {level}" for level in LEVELS])]
     for seed in tqdm(seeds, desc="rendering", unit="seed", disable=not sys.stderr.isatty()):
         rows.append(np.hstack([_tile(_moment(level, seed)) for level in LEVELS]))
@@ -40,31 +40,31 @@ def contact_sheet(seeds: Sequence[int], real: Sequence[ByteImage] = ()) -> ByteI
 
 
 def read_frames(path: Path, count: int = 4) -> list[ByteImage]:
-    """Frames (h, w, 3), evenly spread, of a video, a folder of pictures, or one picture.
+    """Evenly spaced frames (h, w, 3) of a video or a folder of pictures, or one picture.
 
-    Raises SimulationError where there is none.
+    Raises SimulationError if there is none.
     """
     pictures = sorted(p for p in path.iterdir() if p.suffix in (".jpg", ".png")) if path.is_dir() else [path]
     frames = [image for picture in pictures if (image := _picture(picture)) is not None]
-    # A mask or an empty frame is black and white but for the traces of its compression.
+    # A mask or an empty frame is black and white apart from compression artefacts.
     frames = [image for image in frames if ((image > 25) & (image < 230)).mean() > 0.1]
     if not frames and path.is_file():
         frames = _spread_frames(path)
     if not frames:
-        raise SimulationError(f"{path} holds no picture and no video")
+        raise SimulationError(f"{path} contains no picture and no video")
     chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)
     return [np.asarray(frames[index], dtype=np.uint8) for index in chosen]
 
 
 def _picture(path: Path) -> ByteImage | None:
-    """The picture in a file, None where it is none. Raises FileError for what is no file."""
+    """The picture in a file, None if it cannot be decoded. Raises FileError if it is not a file."""
     with open_file(path) as file:
         data = np.frombuffer(file.read(_MOST_PICTURE_BYTES), dtype=np.uint8)
     return None if data.size == 0 else cv2.imdecode(data, cv2.IMREAD_COLOR)  # type: ignore[return-value]
 
 
 def _spread_frames(path: Path) -> list[ByteImage]:
-    """Frames of a video, evenly spread over its length, as many as fit into memory."""
+    """Evenly spaced frames of a video, as many as fit into memory."""
     frames: list[ByteImage] = []
     video, number, every = cv2.VideoCapture(str(path)), 0, 1
     while (read := video.read())[0]:
@@ -83,7 +83,7 @@ def _moment(level: int, seed: int) -> ByteImage:
 
 
 def _tile(image: ByteImage) -> ByteImage:
-    """The middle square of a picture."""
+    """Central square of a picture."""
     height, width = image.shape[:2]
     left = max(0, (width - height) // 2)
     square = image[:, left : left + min(height, width)]
@@ -99,10 +99,10 @@ def _label(texts: Sequence[str]) -> ByteImage:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write a contact sheet; 0 when it is written."""
+    """Write a contact sheet; return 0 if it is written."""
     parser = Parser(prog="contact_sheet", description=__doc__)
-    parser.add_argument("out", type=Path, help="picture to write, .png or .jpg")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[4, 2, 11], help="knees to show, one a row")
+    parser.add_argument("out", type=Path, help="output picture, .png or .jpg")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[4, 2, 11], help="seeds, one knee per row")
     parser.add_argument(
         "--beside", type=Path, nargs="*", default=[], help="real frames: pictures, folders of them, or videos"
     )

@@ -2,4 +2,4 @@
 
 
 class SimulationError(ValueError):
-    """What was asked for cannot be simulated; the message says which rule it breaks."""
+    """Settings that cannot be simulated; the message names the rule that is broken."""

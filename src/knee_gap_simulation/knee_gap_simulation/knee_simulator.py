@@ -1,21 +1,21 @@
-"""The bench: a knee as hard to see as asked for, frame by frame, with the whole truth.
+"""Knee simulator: images of a knee at a chosen difficulty, frame by frame, with ground truth.
 
     bench = KneeSimulator(level=2, seed=5, travel_direction="along")
     for frame in bench.frames():              # rendered one by one; the same arguments give the same bytes
         frame.image, frame.stamp_ns           # (720, 1280, 3) bgr8; nanoseconds
-        frame.T_world_lens_tracked            # what the tracker says, interpolated to the stamp
-        frame.T_world_lens, frame.gap_mask    # the truth
+        frame.T_world_lens_tracked            # as reported by the tracker, interpolated to the stamp
+        frame.T_world_lens, frame.gap_mask    # ground truth
         if frame.index == 0:
             points = bench.points(frame, pixels)      # the surface points behind any pixels (n, 2)
         sightings = bench.follow(points, frame)       # where those same points are now: visibility, pixels,
         ...
-        bench.instrument_gap(frame, edges)    # what an instrument meets between edges (2, 3) of the frame
+        bench.instrument_gap(frame, edges)    # the instrument gap between edges (2, 3) of the frame
 
-Everything may be set one by one: ``KneeSimulator(level=1, difficulty={"debris": 3}, gap=0.004,
-depth=0.010)``; ``gap=None`` gives a closed joint, in which there is no gap to be found. What is not given is
-drawn from the seed: the gap from 3-8 mm, the depth from 8-15 mm. ``bench.lens`` is the lens (an equidistant
-fisheye), ``bench.nearest_distance`` the smallest distance between condyle and meniscus where an instrument
-passes, ``bench.tracked_body_poses()`` the raw poses at 120 Hz.
+Each setting can be given: ``KneeSimulator(level=1, difficulty={"debris": 3}, gap=0.004, depth=0.010)``;
+``gap=None`` gives a closed joint without a gap. Settings that are not given are drawn from the seed: the gap
+from 3-8 mm, the depth from 8-15 mm. ``bench.lens`` is the lens (an equidistant fisheye),
+``bench.nearest_distance`` the smallest distance between condyle and meniscus where an instrument passes,
+``bench.tracked_body_poses()`` the raw poses at 120 Hz.
 """
 
 from collections import deque
@@ -47,12 +47,12 @@ from knee_gap_simulation.scope.media import IN_SALINE, Media, Medium, RefractedL
 from knee_gap_simulation.scope.tracker import track_lens, world_from_scene
 from knee_gap_simulation.surfaces.instrument_gap import InstrumentGap
 
-# Nearer than this to any surface [m] no scope gets.
+# Least distance of the scope from any surface [m].
 LEAST_CLEARANCE = 0.0006
 
 
 class Draw(Enum):
-    """A value that is drawn from the seed."""
+    """Marks a value that is drawn from the seed."""
 
     FROM_SEED = "from the seed"
 
@@ -62,11 +62,11 @@ FROM_SEED = Draw.FROM_SEED
 
 @dataclass(frozen=True, eq=False)
 class SimulatorFrame:
-    """One frame and its truth. Poses are (4, 4), lengths in metres.
+    """One frame and its ground truth. Poses are (4, 4), lengths in metres.
 
     ``gap_mask`` (height, width): the pixels that look into the gap, past condyle, meniscus and probe.
-    ``debris_cover`` (height, width) in [0, 1]: how much of each pixel drifting debris covers. ``probe`` (k,
-    4): the rods of the probe in the scene, empty while it is away.
+    ``debris_cover`` (height, width) in [0, 1]: fraction of each pixel covered by debris. ``probe`` (k, 4):
+    the rods of the probe in the scene, empty while it is away.
     """
 
     index: int
@@ -82,7 +82,7 @@ class SimulatorFrame:
 
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """What a bench shows. Lengths [m], times [s]. ``gap`` None: a closed joint."""
+    """Settings of a simulation. Lengths [m], times [s]. ``gap`` None: a closed joint."""
 
     difficulty: Difficulty
     seed: int
@@ -96,7 +96,7 @@ class SimulatorSettings:
     portal: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values for JSON; those that were not asked for are left out."""
+        """Settings as plain values for JSON; those that were not given are left out."""
         values = asdict(self)
         if self.media == IN_SALINE:
             del values["media"]
@@ -106,7 +106,7 @@ class SimulatorSettings:
 
 
 class KneeSimulator:
-    """A knee, a hand that moves the scope in it, and the pictures and the truth of it."""
+    """A knee, a hand that moves the scope in it, the images and the ground truth."""
 
     def __init__(
         self,
@@ -127,8 +127,9 @@ class KneeSimulator:
     ) -> None:
         """Lengths [m]. ``difficulty`` sets single levels by name; the result is the same for any ``workers``.
 
-        The knee is full of ``medium``; ``bench.lens`` is the lens there, ``Lens()`` that in ``calibrated_in``
-        (the same). ``portal``: how far behind the tip the hand turns the scope, as `HandMotion` has it.
+        The knee is filled with ``medium``; ``bench.lens`` is the lens in it, ``Lens()`` the lens in
+        ``calibrated_in`` (the same by default). ``portal``: distance from the tip back to the pivot of the
+        scope, as in `HandMotion`.
 
         Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
         that does not fit into the joint.
@@ -179,8 +180,8 @@ class KneeSimulator:
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[SimulatorFrame]:
         """Render the frames of a range, lazily and in order, a few ahead on other threads.
 
-        A frame's geometry, noise and debris do not depend on the range; its exposure does, which follows
-        from frame to frame.
+        A frame's geometry, noise and debris do not depend on the range. Its exposure does, since it is
+        controlled from frame to frame.
         """
         camera = KneeCamera(self.scene, self.lens, self.conditions, self.settings.seed)
         indices = range(start, self.frame_count if stop is None else min(stop, self.frame_count), step)
@@ -194,7 +195,7 @@ class KneeSimulator:
                 yield self._frame(camera, *ahead.popleft(), step)
 
     def points(self, frame: SimulatorFrame, pixels: npt.ArrayLike) -> SurfacePoints:
-        """The surface points that pixels (n, 2) [px] of a frame show; NaN where they show none."""
+        """Surface points behind pixels (n, 2) [px] of a frame; NaN if there is none."""
         return surface_points(
             self.scene, self.lens, self.T_world_scene, frame.T_world_lens, frame.probe, pixels
         )
@@ -212,9 +213,9 @@ class KneeSimulator:
     def follow(
         self, points: SurfacePoints, frame: SimulatorFrame, *, edges: bool = True
     ) -> PointObservations:
-        """Where surface points are in a frame, whether they are seen, and the nearest edge of the gap.
+        """Positions and visibility of surface points in a frame, and the nearest edge of the gap.
 
-        Without ``edges`` it is some hundred times faster.
+        Without ``edges`` it is about a hundred times faster.
         """
         return follow(
             self.scene,
@@ -233,7 +234,7 @@ class KneeSimulator:
 
     @property
     def truth(self) -> SceneTruth:
-        """The truth of the knee for any true lens pose, its sections and instrument gaps among it."""
+        """Ground truth of the knee for any true lens pose, including sections and instrument gaps."""
         return SceneTruth(self.scene, self.T_world_scene, self.lens, self.scope, self.probe)
 
     def tracked_body_poses(self) -> tuple[Array, Array, Array]:
@@ -265,7 +266,7 @@ class KneeSimulator:
         return self.T_world_scene @ self._motion.poses(np.maximum(self._body_times, 0.0))
 
     def _tracked_lens(self, time: float) -> Array:
-        """The lens pose that the tracker's two samples around a time give."""
+        """Lens pose interpolated between the two tracker samples around a time."""
         after = int(np.searchsorted(self._body_times, time))
         before = max(0, after - 1)
         pair = self._bodies[[before, after]] @ self.scope.body_to_lens()
@@ -275,7 +276,7 @@ class KneeSimulator:
         return rigid(turn, (1.0 - share) * pair[0, :3, 3] + share * pair[1, :3, 3])
 
     def _shift(self, time: float) -> Array:
-        """How far [px] the middle of the picture moves while the shutter is open around a time."""
+        """Shift of the centre of the image [px] while the shutter is open around a time."""
         half = 0.5 * self.conditions.shutter_s
         begin, end = self._motion.poses(np.array([time - half, time + half]))
         place = begin[:3, 3] + self.settings.depth * begin[:3, 2]
@@ -283,7 +284,7 @@ class KneeSimulator:
         return np.asarray(pixels[1] - pixels[0])
 
     def _place_hand(self, rng: np.random.Generator) -> HandMotion:
-        """A hand whose whole travel keeps clear of the tissue, as near as it can to where it was drawn."""
+        """Hand motion that keeps clear of the tissue over its whole travel, as near the draw as possible."""
         settings = self.settings
         hand = Hand(reach_s=3.3, tremor=self.conditions.tremor)
         roll, pitch = rng.uniform(-0.35, 0.35), rng.uniform(-0.10, 0.12)

@@ -1,4 +1,4 @@
-"""`make_bag`: a bag of a scene whose gap is known."""
+"""The command `make_bag`: a simulated bag of a scene of known gap."""
 
 import argparse
 import sys
@@ -46,19 +46,19 @@ from knee_gap_simulation.scope.media import INDICES, Media, Medium, RefractedLen
 from knee_gap_simulation.scope.tracker import track_lens, world_from_scene
 
 TURN_BEGIN_S = 0.5
-TURN_PERIOD_S = 4.0  # of a turn to and fro
+TURN_PERIOD_S = 4.0  # of one rotation to and fro
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of the simple scene of two rims. Lengths [m], times [s].
+    """Settings of a recording of the simple scene of two rims. Lengths [m], times [s].
 
-    `scope_of` is the seed of a calibration recording, of whose scope and lens this is another recording;
-    without it they are the nominal ones. `video_delay`: how late images are stamped. `turn` [rad]: how far
-    that scope is turned to and fro in its camera head, which carries the tracked body; its notch is seen
-    then. The rims lie in `medium` (saline). The lens was calibrated in `calibrated_in`: the same medium, but
-    air for the scope of a calibration recording. `portal` is how far behind the tip the hand turns the
-    scope, as `HandMotion` has it.
+    `scope_of` is the seed of a calibration recording, whose scope and lens are used; without it they are the
+    nominal ones. `video_delay` is the delay of the images' stamps. `turn` [rad] is the amplitude of the
+    rotation of that scope in its camera head, to which the tracked body is fixed; its notch is then visible.
+    The rims lie in `medium` (saline). The lens was calibrated in `calibrated_in`: by default the same medium,
+    but air for the scope of a calibration recording. `portal` is the distance from the tip back to the pivot
+    of the scope, as in `HandMotion`.
     """
 
     gap: float = 0.004
@@ -77,13 +77,13 @@ class Recording:
 
     @property
     def media(self) -> Media:
-        """What the lens was calibrated in and is used in."""
+        """Media in which the lens was calibrated and is used."""
         used_in: Medium = "saline" if self.medium is None else self.medium
         calibrated_in = used_in if self.scope_of is None else "air"
         return Media(calibrated_in if self.calibrated_in is None else self.calibrated_in, used_in)
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values for JSON; media and portal where they were asked for."""
+        """Settings as plain values for JSON; media and portal only if they were given."""
         optional = ("medium", "calibrated_in", "portal")
         return {
             name: value for name, value in vars(self).items() if name not in optional or value is not None
@@ -102,23 +102,23 @@ class Recording:
         if not abs(self.video_delay) <= 0.2:
             raise SimulationError(f"the video's delay must lie in [-0.2, 0.2] s, not {self.video_delay:g} s")
         if self.turn is not None and self.scope_of is None:
-            raise SimulationError("only a scope of a calibration bag is turned: say --scope-of as well")
+            raise SimulationError("only the scope of a calibration bag can rotate: add --scope-of")
 
     def turn_at(self, time: npt.ArrayLike) -> Array:
-        """Turn [rad] of the scope in its camera head at times (...) [s]."""
+        """Rotation [rad] of the scope in its camera head at times (...) [s]."""
         since = np.maximum(np.asarray(time, dtype=np.float64) - TURN_BEGIN_S, 0.0)
         return np.asarray((self.turn or 0.0) * 0.5 * (1.0 - np.cos(2.0 * np.pi * since / TURN_PERIOD_S)))
 
 
 class _View:
-    """Where the lens is in the scene, and where its notch is in the picture, at any time [s]."""
+    """Pose of the lens in the scene and direction of its notch in the image, over time [s]."""
 
     def __init__(self, recording: Recording, motion: HandMotion, scope: RotatedScope) -> None:
         self._recording, self._motion, self._scope = recording, motion, scope
         self._T_lens_body = inverse(scope.body_to_lens(0.0))
 
     def lens(self, time: float) -> Array:
-        """``T_scene_lens`` (4, 4): the hand moves the camera head, in which the scope turns."""
+        """``T_scene_lens`` (4, 4): the hand moves the camera head, in which the scope rotates."""
         straight = self._motion.poses(time)
         if self._recording.turn is None:
             return straight
@@ -126,17 +126,17 @@ class _View:
         return np.asarray(straight @ self._T_lens_body @ self._scope.body_to_lens(turn))
 
     def notch(self, time: float) -> float | None:
-        """Angle of the notch [rad]; None for a scope that shows none."""
+        """Angle of the notch [rad]; None for a scope without a visible notch."""
         if self._recording.turn is None:
             return None
         return self._scope.notch_angle + float(self._recording.turn_at(time))
 
 
 def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> SceneTruth:
-    """Render a recording of the simple scene into a new bag at ``path`` and return its truth.
+    """Render a recording of the simple scene into a new bag at ``path``; return its ground truth.
 
-    Beside the data the folder gets ``scope.yaml``, the parameters of the nodes that see and track. Raises
-    SimulationError for a recording that cannot be made and BagError where the bag cannot be written.
+    The folder also gets ``scope.yaml``, the parameters of segmentation_node and tracking_node. Raises
+    SimulationError for settings that cannot be simulated and BagError if the bag cannot be written.
     """
     scene = RimScene.random(recording.gap, recording.seed)
     lens, turned = Lens(), RotatedScope()
@@ -171,7 +171,7 @@ def make_bag(path: Path, recording: Recording, *, progress: bool = True) -> Scen
 
 
 def make_knee_bag(path: Path, simulator: KneeSimulator, *, progress: bool = True) -> SceneTruth:
-    """Render a bench into a new bag at ``path``, as `make_bag` does, and return its truth."""
+    """Render a knee simulation into a new bag at ``path``, as `make_bag` does; return its ground truth."""
     truth = SceneTruth(
         simulator.scene,
         simulator.T_world_scene,
@@ -224,7 +224,7 @@ def _knee_images(simulator: KneeSimulator, *, progress: bool) -> Iterator[Sample
 
 
 class _Progress:
-    """Tells of rendered images: a bar on a terminal, a line every 60 images elsewhere."""
+    """Progress of rendering: a bar on a terminal, else a line every 60 images."""
 
     def __init__(self, count: int, *, progress: bool) -> None:
         self._count, self._done, self._lines = count, 0, progress and not sys.stderr.isatty()
@@ -249,7 +249,7 @@ def difficulty_argument(text: str) -> tuple[str, int]:
     """A difficulty and its level from NAME=LEVEL. Raises argparse.ArgumentTypeError."""
     name, _, level = text.partition("=")
     if not level.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=LEVEL, as debris=3")
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=LEVEL, such as debris=3")
     try:
         Difficulty.at(0, {name: int(level)})
     except SimulationError as error:
@@ -261,65 +261,65 @@ def _parser() -> Parser:
     defaults = Recording()
     parser = Parser(
         prog="make_bag",
-        description="Make a bag of a scene whose gap is known, seen by a tracked arthroscope: two rims, "
-        "or with --level a knee.",
+        description="Make a bag of a scene of known gap, seen by a tracked arthroscope: two rims, or with "
+        "--level a knee.",
     )
     parser.add_argument("out", type=Path, help="folder of the new bag")
     parser.add_argument(
         "--gap-mm",
         type=finite,
-        help="distance of the rims (4); in a knee the smallest distance (drawn from 3-8)",
+        help="distance between the rims (4); for a knee the smallest distance (drawn from 3-8)",
     )
     parser.add_argument(
-        "--depth-mm", type=finite, help="from the lens to the gap (10; in a knee drawn from 8-15)"
+        "--depth-mm", type=finite, help="distance from the lens to the gap (10; for a knee drawn from 8-15)"
     )
     parser.add_argument("--travel-mm", type=finite, default=1e3 * defaults.travel, help="travel of the scope")
     parser.add_argument("--seed", type=int, default=defaults.seed, help="the same seed gives the same bag")
-    parser.add_argument("--duration-s", type=finite, help="length of the recording (6; a knee 4)")
-    parser.add_argument("--fps", type=finite, help="images a second (60; to calibrate from, 30)")
-    parser.add_argument("--quality", type=int, help="of the JPEG images of the rims, 1-100 (60)")
-    parser.add_argument("--level", type=int, choices=range(4), help="a knee, this hard to see")
+    parser.add_argument("--duration-s", type=finite, help="length of the recording (6; for a knee 4)")
+    parser.add_argument("--fps", type=finite, help="images per second (60; with --calibration 30)")
+    parser.add_argument("--quality", type=int, help="JPEG quality of the images of the rims, 1-100 (60)")
+    parser.add_argument("--level", type=int, choices=range(4), help="a knee of this difficulty")
     parser.add_argument(
         "--difficulty",
         type=difficulty_argument,
         action="append",
         default=[],
         metavar="NAME=LEVEL",
-        help=f"of a knee, one by one: {', '.join(Difficulty.__dataclass_fields__)}",
+        help=f"single difficulties of a knee: {', '.join(Difficulty.__dataclass_fields__)}",
     )
     parser.add_argument(
         "--travel-direction", choices=[str(d) for d in TravelDirection], help="in a knee (along the gap)"
     )
-    parser.add_argument("--no-gap", action="store_true", help="a knee that is closed: no gap is to be found")
-    parser.add_argument("--calibration", action="store_true", help="a board and pivoting, to calibrate from")
+    parser.add_argument("--no-gap", action="store_true", help="a closed knee, without a gap")
+    parser.add_argument("--calibration", action="store_true", help="record a board and pivoting to calibrate")
     parser.add_argument(
-        "--video-delay-ms", type=finite, help="how late images are stamped (0; to calibrate from, 12)"
+        "--video-delay-ms", type=finite, help="delay of the images' stamps (0; with --calibration 12)"
     )
-    parser.add_argument("--board", choices=BOARDS, help="to calibrate from (charuco)")
-    parser.add_argument("--lens", choices=LENSES, help="to calibrate (equidistant)")
+    parser.add_argument("--board", choices=BOARDS, help="calibration board (charuco)")
+    parser.add_argument("--lens", choices=LENSES, help="lens to calibrate (equidistant)")
     parser.add_argument(
         "--turn-deg",
         type=finite,
-        help="turn that scope to and fro in its camera head, its notch in the picture (it shows none)",
+        help="rotate that scope to and fro in its camera head, with a visible notch (no rotation, no notch)",
     )
     parser.add_argument(
-        "--scope-of", type=int, metavar="SEED", help="the rims seen by the scope of this calibration bag"
+        "--scope-of", type=int, metavar="SEED", help="use the scope of the calibration bag of this seed"
     )
     parser.add_argument(
         "--medium",
         type=medium_argument,
-        help="what fills the joint (saline), or the board lies in (air): air, saline, water or an index",
+        help="medium in the joint (saline) or around the board (air): air, saline, water or an index",
     )
     parser.add_argument(
         "--calibrated-in",
         type=medium_argument,
         metavar="MEDIUM",
-        help="what the lens of camera_info was calibrated in (the same; with --scope-of air)",
+        help="medium in which the lens of camera_info was calibrated (the same; with --scope-of air)",
     )
     parser.add_argument(
         "--portal-mm",
         type=float,
-        help="the hand turns the scope about a portal so far behind its tip (it turns by 2.5 deg)",
+        help="pivot the scope about a portal this far behind its tip (default: a rotation of 2.5 deg)",
     )
     return parser
 
@@ -390,7 +390,7 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
     )
     if arguments.no_gap or arguments.difficulty or any(value is not None for value in others):
         raise SimulationError(
-            "--calibration shows a board: there is no gap, knee, depth, portal or other medium to choose"
+            "--calibration shows a board: gap, knee, depth, portal and medium of calibration do not apply"
         )
     defaults = CalibrationRecording()
     delay_ms = 1e3 * defaults.video_delay if arguments.video_delay_ms is None else arguments.video_delay_ms
@@ -414,7 +414,7 @@ def _printed_times(times: Iterator[float], count: int) -> Iterator[float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a bag; 0 when it is made."""
+    """Make a bag; return 0 if it is written."""
     arguments = _parser().parse_args(argv)
     turned = arguments.turn_deg is not None
     of_rims = (

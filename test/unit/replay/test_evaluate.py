@@ -156,10 +156,10 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "a.png").write_bytes(b"no image")
     for folder, reason in (
-        ("nowhere", "is no folder"),
+        ("nowhere", "is not a folder"),
         ("empty", "has the name"),
         ("small", "one size"),
-        ("broken", "is no image"),
+        ("broken", "cannot be read as an image"),
     ):
         assert main([str(tmp_path / folder), str(tmp_path / "marked"), "--out", str(tmp_path / "out")]) == 1
         lines = [line for line in capsys.readouterr().err.splitlines() if "evaluating" not in line]

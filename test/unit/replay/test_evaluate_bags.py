@@ -91,11 +91,11 @@ def test_mistakes_are_one_line(simulated: Path, tmp_path: Path, capsys: pytest.C
     untrue = masks(tmp_path / "untrue", {MASK: [1]}, shift=0)
     elsewhere = masks(tmp_path / "elsewhere", {MASK: [1], TRUTH: [2]}, shift=0)
     for arguments, reason in (
-        ([str(untrue)], "has no truth"),
+        ([str(untrue)], "has no ground truth"),
         ([str(elsewhere)], "has the stamp"),
         ([str(simulated), "--every", "0"], "--every must"),
         ([str(simulated), "--image-topic", "/nowhere"], "/nowhere is not in"),
-        ([str(tmp_path)], "is no bag"),
+        ([str(tmp_path)], "is not a bag or a folder"),
     ):
         assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
         lines = [line for line in capsys.readouterr().err.splitlines() if "evaluating" not in line]

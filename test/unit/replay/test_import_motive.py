@@ -76,7 +76,7 @@ def test_a_start_that_cannot_be_read_must_be_told(tmp_path, capsys):
     [
         (["femur"], ROWS, "no rigid body 'femur'; it has: 'scope'"),
         (["scope"], ROWS[:-8], "the file ends in the middle of it"),
-        (["scope"], "0,0.0,,,,,,,\n", "is not seen in any frame"),
+        (["scope"], "0,0.0,,,,,,,\n", "is not tracked in any frame"),
         (["scope", "--start", "1", "--offset", "-5"], ROWS, "before 1970"),
     ],
 )
@@ -95,7 +95,7 @@ def test_a_recorded_take(tmp_path, capsys):
         pytest.skip(f"no recorded take at {TAKE}")
     out = tmp_path / "bag"
     assert main([str(TAKE), "device03", str(out), "--reference", "device05"]) == 0
-    assert "says 190951 frames and holds 934" in capsys.readouterr().err
+    assert "190951 frames by the header, 934 in the file" in capsys.readouterr().err
     scope, leg = poses(out), poses(out, "/knee_gap/reference_body/pose")
     assert len(scope) > 925
     assert 740 < len(leg) < 760

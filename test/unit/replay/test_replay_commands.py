@@ -91,9 +91,9 @@ def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("pose_from_ms", "skip", "reason"),
     [
-        (0, POSE, f"not usable: nothing readable on {POSE}"),
-        (0, IMAGE, f"not usable: nothing readable on {IMAGE}"),
-        (500, "", "not usable: only 50% of the images lie between poses at most 25 ms away"),
+        (0, POSE, f"not usable: no readable message on {POSE}"),
+        (0, IMAGE, f"not usable: no readable message on {IMAGE}"),
+        (500, "", "not usable: only 50% of the images have poses within 25 ms before and after them"),
     ],
 )
 def test_check_tells_why_a_bag_cannot_be_used(

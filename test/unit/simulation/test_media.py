@@ -132,7 +132,7 @@ def test_a_knee_and_a_board_lie_in_the_medium_too() -> None:
     ("arguments", "words"),
     [
         (["--medium", "beer"], "a medium must be"),
-        (["--calibration", "--portal-mm", "50"], "there is no gap"),
+        (["--calibration", "--portal-mm", "50"], "do not apply"),
         (["--portal-mm", "1"], "portal must lie in"),
     ],
 )

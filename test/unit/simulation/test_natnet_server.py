@@ -250,5 +250,5 @@ def test_mistakes_on_the_command_line_are_one_line(arguments, capsys):
 
 
 def test_bodies_need_names_that_differ():
-    with pytest.raises(SimulationError, match="names that differ"):
+    with pytest.raises(SimulationError, match="must have different names"):
         TrackedScene(("scope", "scope"))

@@ -1,1 +1,1 @@
-"""What a launch starts, in which order, and how it ends."""
+"""Launch plans: the processes of a launch, their order, and how it ends."""

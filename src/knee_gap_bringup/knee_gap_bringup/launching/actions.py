@@ -1,6 +1,6 @@
-"""A plan as launch's own actions, for the launch files.
+"""Conversion of a plan to actions of the ROS package `launch`, for the launch files.
 
-launch is imported where it is used: this module can be read where launch is not installed.
+launch is imported inside the functions, so that this module can be imported if launch is not installed.
 """
 
 import atexit
@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable
 
 from knee_gap_bringup.launching.plan import DRAIN, RESPAWN_DELAY, Next, PlannedProcess, Role, reaction
 
-# A signal that reaches a node before it can handle one waits, until its entry point lets it through.
+# A signal that arrives before a node can handle it stays pending until its entry point unblocks it.
 SIGNALS_WAIT = ("env", "--block-signal=INT", "--block-signal=TERM")
 
 
 def prefix() -> str:
-    """What stands before a node's command: `SIGNALS_WAIT` where this machine's `env` knows how."""
+    """Prefix of a node's command: `SIGNALS_WAIT` if this machine's `env` supports it."""
     can = subprocess.run([*SIGNALS_WAIT, "true"], capture_output=True, check=False).returncode == 0
     return " ".join(SIGNALS_WAIT) if can else ""
 
@@ -25,12 +25,12 @@ def prefix() -> str:
 def refuse(problem: str) -> None:
     """End the launch with 1 and one line if there is a problem."""
     if problem:
-        # What launch prints of an exception is its message, in one line.
+        # launch prints the message of an exception in one line.
         raise RuntimeError(problem)
 
 
 def actions(plan: Iterable[PlannedProcess], respawn_delay: float = RESPAWN_DELAY) -> list[object]:
-    """Each process, and what follows its end."""
+    """Actions for each process and for its end."""
     from launch.actions import RegisterEventHandler
     from launch.event_handlers import OnProcessExit
 
@@ -48,7 +48,7 @@ def _node(process: PlannedProcess, respawn_delay: float) -> object:
     return Node(
         package=process.package,
         executable=process.executable,
-        # Player and recorder take absolute topics, and name themselves.
+        # Player and recorder take absolute topics and set their own node names.
         **({"name": process.executable, "namespace": process.namespace} if is_node else {}),
         parameters=[*process.parameters] if is_node else None,
         arguments=[*process.arguments],
@@ -72,7 +72,10 @@ def _on_exit(process: PlannedProcess) -> Callable[[object, object], list[object]
         if answer.next is Next.END_AFTER_DRAIN:
             return [TimerAction(period=DRAIN, actions=[EmitEvent(event=Shutdown(reason=answer.words))])]
         if answer.next is Next.END:
-            return [LogInfo(msg=f"{answer.words}; all ends"), EmitEvent(event=Shutdown(reason=answer.words))]
+            return [
+                LogInfo(msg=f"{answer.words}; stopping all"),
+                EmitEvent(event=Shutdown(reason=answer.words)),
+            ]
         return []
 
     return follow
@@ -82,7 +85,7 @@ _codes: list[int] = []
 
 
 def leave_with(code: int) -> None:
-    """Make `ros2 launch` end with a code: by itself it knows only 0, and 1 for its own exceptions."""
+    """Make `ros2 launch` exit with a code: by itself it returns 0, or 1 for its own exceptions."""
     if not _codes:
         atexit.register(_leave)
     _codes.append(code)

@@ -1,4 +1,4 @@
-"""The three nodes on live topics, as live.launch.py starts them, where launch is not installed."""
+"""The command `live`: the three nodes on live topics, as by live.launch.py, without the package launch."""
 
 import argparse
 import sys
@@ -18,19 +18,19 @@ def tell(line: str) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the nodes until a signal comes or one of them fails for good; return its code, or 0."""
+    """Run the nodes until a signal or a final failure of a node; return its exit code, or 0."""
     params = Path(get_package_share_directory("knee_gap_bringup")) / "config" / "knee_gap.yaml"
     parser = Parser(prog="live", description=__doc__)
-    parser.add_argument("--params", default=str(params), metavar="FILE", help="parameters of the nodes")
+    parser.add_argument("--params", default=str(params), metavar="FILE", help="parameter file of the nodes")
     parser.add_argument("--namespace", default="knee_gap", help="namespace of the nodes (knee_gap)")
     parser.add_argument(
         "--respawn",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="start a node that ended again (yes)",
+        help="restart a node that ended (yes)",
     )
     parser.add_argument(
-        "--respawn-delay", default=str(RESPAWN_DELAY), metavar="S", help="pause before that (1)"
+        "--respawn-delay", default=str(RESPAWN_DELAY), metavar="S", help="pause before a restart (1)"
     )
     arguments = parser.parse_args(argv)
     if problem := live_problem(arguments.params, arguments.respawn_delay):

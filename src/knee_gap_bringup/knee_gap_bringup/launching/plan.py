@@ -1,7 +1,7 @@
-"""What is started together, what is wrong before anything is, and what follows when a process ends.
+"""Launch plans: the processes to start, checks before the start, and reactions to the end of a process.
 
-Plain data and plain functions: the launch files turn a plan into launch's actions; where launch is not
-installed, `supervisor` runs it. Both behave alike because both ask here.
+They are plain data and functions. The launch files convert a plan to actions of launch; if launch is not
+installed, `supervisor` runs it. Both use these functions, so they behave alike.
 """
 
 import math
@@ -34,16 +34,16 @@ OUTPUTS = (
     "motion_advice",
 )
 CALIBRATION_FILE = "calibration.yaml"
-# Time for the last image to pass through the nodes [s].
+# Time allowed for the last image to pass through the nodes [s].
 DRAIN = 1.0
-# Pause before a node that ended is started again [s].
+# Pause before a node that ended is restarted [s].
 RESPAWN_DELAY = 1.0
-# With this code a node refuses its settings: started again, it would refuse them again.
+# Exit code of a node that refuses its parameters: after a restart it would refuse them again.
 REFUSED_SETTINGS = 2
 
 
 class Role(Enum):
-    """What a process is for, which decides what its end means."""
+    """Role of a process, which determines the reaction to its end."""
 
     NODE = "node"
     PLAYER = "player"
@@ -51,7 +51,7 @@ class Role(Enum):
 
 
 class Next(Enum):
-    """What follows the end of a process."""
+    """Reaction to the end of a process."""
 
     START_AGAIN = "start again"
     END_AFTER_DRAIN = "end after the last image"
@@ -60,7 +60,7 @@ class Next(Enum):
 
 
 class Reaction(NamedTuple):
-    """What follows, the exit code that the whole ends with, and why."""
+    """Reaction, exit code of the launch, and reason."""
 
     next: Next
     code: int
@@ -69,7 +69,7 @@ class Reaction(NamedTuple):
 
 @dataclass(frozen=True)
 class PlannedProcess:
-    """One process; `parameters` are files and mappings, as launch takes them."""
+    """One process; `parameters` are files and mappings, as in launch."""
 
     package: str
     executable: str
@@ -81,7 +81,7 @@ class PlannedProcess:
 
     @property
     def ros_arguments(self) -> tuple[str, ...]:
-        """The arguments by which a node takes its namespace and parameters on a command line."""
+        """Command line arguments that set a node's namespace and parameters."""
         if self.role is not Role.NODE:
             return ()
         given = ["--ros-args", "-r", f"__ns:={absolute(self.namespace)}"]
@@ -95,7 +95,7 @@ class PlannedProcess:
 
 
 def live_plan(params: str, namespace: str, *, respawn: bool = True) -> tuple[PlannedProcess, ...]:
-    """The three nodes with one parameter file; `respawn`: those that end are started again."""
+    """Plan of the three nodes with one parameter file; with `respawn`, nodes that end are restarted."""
     return tuple(
         PlannedProcess(package, name, namespace=namespace, parameters=(params,), respawn=respawn)
         for name, package in NODES.items()
@@ -105,7 +105,7 @@ def live_plan(params: str, namespace: str, *, respawn: bool = True) -> tuple[Pla
 def replay_plan(
     bag: str, out: str, *, rate: str = "1.0", params: str = "", namespace: str = "knee_gap"
 ) -> tuple[PlannedProcess, ...]:
-    """The three nodes, a recorder of their output if `out` is given, and the player, whose end ends all."""
+    """Plan of the three nodes, a recorder if `out` is given, and the player, whose end ends the launch."""
     space = absolute(namespace)
     inputs = [f"{space}/{topic}" for topic in INPUTS]
     given = (params,) if params else ()
@@ -126,10 +126,10 @@ def replay_plan(
 
 
 def _beside(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
-    """What stands beside a simulated bag for a node: its calibration, or where its lens nominally sits."""
+    """Parameters for a node in a simulated bag's folder: its calibration, or the nominal pose of the lens."""
     calibration, nominal = bag / CALIBRATION_FILE, bag / "scope.yaml"
     if calibration.is_file():
-        # uncertainty_node is told by the two others.
+        # uncertainty_node receives it from the two others.
         return () if node == "uncertainty_node" else ({"calibration_file": str(calibration.resolve())},)
     return (str(nominal),) if node == "tracking_node" and nominal.is_file() else ()
 
@@ -142,7 +142,7 @@ def live_problem(params: str, respawn_delay: str = str(RESPAWN_DELAY)) -> str:
 
 
 def replay_problem(bag: str, out: str, *, rate: str = "1.0", params: str = "") -> str:
-    """Why a bag cannot be replayed, in one line; empty if it can. Looks before anything is started."""
+    """Why a bag cannot be replayed, in one line; empty if it can. To be called before anything is started."""
     if missing := missing_bag(Path(bag)):
         return f"bag: {missing}"
     if out and os.path.lexists(out):
@@ -153,11 +153,11 @@ def replay_problem(bag: str, out: str, *, rate: str = "1.0", params: str = "") -
 
 
 def reaction(process: PlannedProcess, code: int, *, ending: bool = False) -> Reaction:
-    """What follows when a process ended with `code`, negative for a signal; `ending`: all were asked to."""
+    """Reaction to a process that ended with `code`, negative for a signal; `ending`: shutdown has begun."""
     name, exit_code = process.executable, exit_code_of(code)
     words = f"{name} ended with exit code {code}" if code >= 0 else f"{name} was ended by signal {-code}"
     if process.role is Role.RECORDER and code != 0:
-        # What was recorded is not whole, however all came to its end.
+        # The recording is incomplete, whatever ended the launch.
         return Reaction(Next.NOTHING if ending else Next.END, exit_code, words)
     if ending:
         return Reaction(Next.NOTHING, 0, words)
@@ -169,12 +169,12 @@ def reaction(process: PlannedProcess, code: int, *, ending: bool = False) -> Rea
 
 
 def exit_code_of(code: int) -> int:
-    """The exit code by which a shell tells how a process ended, of 128 and more for a signal."""
+    """Exit code of a process as a shell reports it: 128 plus the signal if a signal ended it."""
     return code if code >= 0 else 128 - code
 
 
 def absolute(namespace: str) -> str:
-    """A namespace as topics carry it."""
+    """A namespace in the form that topics have."""
     return "/" + namespace.strip("/")
 
 

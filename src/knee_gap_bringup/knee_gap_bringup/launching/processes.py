@@ -1,4 +1,4 @@
-"""Processes of the suite, started together, heard when they are ready, and ended by their own id."""
+"""Group of child processes: started together, awaited until ready, and ended by their own ids."""
 
 import os
 import signal
@@ -13,16 +13,16 @@ from ament_index_python.packages import get_package_prefix
 
 from knee_gap_bringup.launching.plan import exit_code_of
 
-# What every node logs once it can take messages.
+# Logged by every node once it can receive messages.
 READY = "ready"
-# Time a process has to end after it was asked to [s].
+# Time allowed for a process to end after a request [s].
 GRACE = 10.0
 
 
 class StartError(RuntimeError):
-    """A process did not come up, or ended before its time; the message says which and its last words.
+    """A process did not start, or ended too early; the message names it and quotes its last line.
 
-    `code` is what the whole ends with: the process's own exit code, 1 where it has none or ended with 0.
+    `code` is the exit code of the command: that of the process, or 1 if it has none or ended with 0.
     """
 
     def __init__(self, message: str, code: int = 1) -> None:
@@ -36,7 +36,7 @@ def executable(package: str, name: str) -> str:
 
 
 class Processes:
-    """Named processes, each with a log file; leaving the context ends those that still run."""
+    """Named processes, each with a log file. Leaving the context ends those that are still running."""
 
     def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
         self._log_folder = log_folder
@@ -61,12 +61,12 @@ class Processes:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=self._environment,
-                # A Ctrl-C in the terminal is for whoever started these, who then ends them in order.
+                # A Ctrl-C in the terminal goes to the parent only, which then ends these in order.
                 start_new_session=True,
             )
 
     def log(self, name: str) -> Path:
-        """Where a process's output goes."""
+        """Log file of a process."""
         return self._log_folder / f"{name}.log"
 
     def pid(self, name: str) -> int:
@@ -74,7 +74,7 @@ class Processes:
         return self._running[name].pid
 
     def wait_ready(self, names: Sequence[str], timeout: float) -> None:
-        """Return once each process has said that it is ready. Raises StartError."""
+        """Return once each process has logged that it is ready. Raises StartError."""
         deadline = time.monotonic() + timeout
         for name in names:
             while READY not in self.log(name).read_text(errors="replace"):
@@ -90,14 +90,14 @@ class Processes:
             raise StartError(f"{name} ended with exit code {code}: {self.last_words(name)}", code)
 
     def last_words(self, name: str) -> str:
-        """Last line that a process wrote."""
+        """Last line of a process's output."""
         lines = self.log(name).read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "(it said nothing)"
+        return lines[-1] if lines else "(no output)"
 
     def wait(self, name: str, beside: Sequence[str] = ()) -> int:
         """Wait until a process ends by itself; return its exit code.
 
-        Raises StartError if one of `beside` ends meanwhile.
+        Raises StartError if one of `beside` ends before.
         """
         while self._running[name].poll() is None:
             for other in beside:
@@ -106,7 +106,7 @@ class Processes:
         return self._running.pop(name).wait()
 
     def end(self, name: str) -> int:
-        """Ask a process to end, kill it if it does not; return its exit code."""
+        """Ask a process to end, and kill it if it does not; return its exit code."""
         process = self._running.pop(name)
         if process.poll() is None:
             process.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""A bag through the three nodes, as replay.launch.py plays it, where launch is not installed."""
+"""The command `replay`: a bag played to the nodes, as by replay.launch.py, without the package launch."""
 
 import signal
 import sys
@@ -19,11 +19,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(prog="replay", description=__doc__)
     parser.add_argument("bag", metavar="BAG", help="bag folder or .mcap file")
     parser.add_argument(
-        "--out", default="", metavar="OUT", help="bag to record the results in; must not exist"
+        "--out", default="", metavar="OUT", help="bag to record the results to; must not exist"
     )
     parser.add_argument("--rate", default="1.0", metavar="R", help="times as fast as recorded (1)")
     parser.add_argument(
-        "--params", default="", metavar="FILE", help="parameters of the nodes (scope.yaml of the bag)"
+        "--params", default="", metavar="FILE", help="parameter file of the nodes (scope.yaml of the bag)"
     )
     parser.add_argument("--namespace", default="knee_gap", help="namespace of the nodes (knee_gap)")
     given = parser.parse_args(argv)

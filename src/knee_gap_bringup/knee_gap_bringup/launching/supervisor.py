@@ -1,4 +1,4 @@
-"""Runs a plan where launch is not installed: starts it, keeps it running, and ends it with one exit code."""
+"""Supervisor that runs a plan without the package launch: starts, restarts and ends its processes."""
 
 import signal
 import subprocess
@@ -27,10 +27,10 @@ def supervise(
     respawn_delay: float = RESPAWN_DELAY,
     stopped_code: int = 0,
 ) -> int:
-    """Run a plan to its end; return 0, or the code of the process that failed.
+    """Run a plan to its end; return 0, or the exit code of the process that failed.
 
-    `tell` takes a line on each start and end. On SIGINT and SIGTERM all are ended in order, and
-    `stopped_code` is returned.
+    `tell` is called with one line for each start and end. On SIGINT and SIGTERM, all processes are ended in
+    order, and `stopped_code` is returned.
     """
     supervisor = _Supervisor(plan, tell, respawn_delay, stopped_code)
     try:
@@ -50,8 +50,7 @@ class _Supervisor:
         self._plan, self._tell = plan, tell
         self._respawn_delay, self._stopped_code = respawn_delay, stopped_code
         self._running: dict[int, subprocess.Popen[bytes]] = {}
-        # When a process that ended is started again, and when all ends after the last image; by the monotonic
-        # clock [s].
+        # Times of the next restarts, and of the shutdown after the last image; monotonic clock [s].
         self._due: dict[int, float] = {}
         self._end_at = float("inf")
         self._stop = False
@@ -74,7 +73,7 @@ class _Supervisor:
                     del self._running[index]
                     answer = reaction(self._plan[index], code)
                     if answer.next is Next.END:
-                        self._tell(f"{answer.words}; all ends")
+                        self._tell(f"{answer.words}; stopping all")
                         self.end()
                         return answer.code
                     self._follow(index, answer)
@@ -83,7 +82,7 @@ class _Supervisor:
         return self.end() or self._stopped_code
 
     def end(self) -> int:
-        """End what runs, all at once; return the code of what failed to end well."""
+        """End all running processes at once; return the exit code of one that failed."""
         code, began = 0, time.monotonic()
         for process in self._running.values():
             if process.poll() is None:
@@ -105,7 +104,7 @@ class _Supervisor:
     def _follow(self, index: int, answer: Reaction) -> None:
         now = time.monotonic()
         if answer.next is Next.START_AGAIN:
-            self._tell(f"{answer.words}; started again in {self._respawn_delay:g} s")
+            self._tell(f"{answer.words}; restart in {self._respawn_delay:g} s")
             self._due[index] = now + self._respawn_delay
         elif answer.next is Next.END_AFTER_DRAIN:
             self._end_at = now + DRAIN
@@ -117,10 +116,10 @@ class _Supervisor:
             *planned.arguments,
             *planned.ros_arguments,
         ]
-        # A signal that reaches the process before it can handle one waits; its entry point lets it through.
+        # A signal that arrives before the process can handle it stays pending; its entry point unblocks it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
         try:
-            # A Ctrl-C in the terminal is for this process, which then ends the others in order.
+            # A Ctrl-C in the terminal goes to this process only, which then ends the others in order.
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)

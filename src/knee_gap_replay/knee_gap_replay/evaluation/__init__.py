@@ -1,1 +1,1 @@
-"""The command `evaluate`: predicted gap masks against marked or simulated ones."""
+"""The command `evaluate`: predicted gap masks compared with hand-marked or simulated ones."""

@@ -1,4 +1,4 @@
-"""`evaluate`: predicted masks of the gap against marked ones (the paper's II-E, Table 2 and figure 8)."""
+"""The command `evaluate`: scores of predicted gap masks (the paper's II-E, Table 2 and figure 8)."""
 
 import argparse
 import csv
@@ -26,7 +26,7 @@ from knee_gap_replay.evaluation.pairs import SHEET_ROWS, BagTopics, Pair, bag_pa
 
 
 class Row(NamedTuple):
-    """What one pair came to."""
+    """Scores of one pair of masks."""
 
     image_set: str
     name: str
@@ -35,9 +35,9 @@ class Row(NamedTuple):
 
 
 def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Row]:
-    """Judge every pair; write its difference picture, and a sheet of the first of each set, into a folder.
+    """Score every pair; write its difference picture, and a sheet of the first pair of each set, to a folder.
 
-    Without a camera the paper's equiangular one of 90 by 90 degrees is taken, at each image's size.
+    Without a camera, the paper's equiangular camera of 90 by 90 degrees is used at each image's size.
     """
     rows: list[Row] = []
     sheet: list[Image] = []
@@ -62,7 +62,7 @@ def evaluate(pairs: Iterable[Pair], camera: Camera | None, out: Path) -> list[Ro
 
 
 def table(rows: Sequence[Row]) -> list[dict[str, float | str | int]]:
-    """The rows of Table 2: each set, and all of them: Dice, RMS errors at G0 and G1 and their average."""
+    """Rows of Table 2, one for each set and one for all: Dice, RMS errors at G0 and G1 and their average."""
     sets = list(dict.fromkeys(row.image_set for row in rows))
     groups = [(name, [row for row in rows if row.image_set == name]) for name in sets]
     if len(sets) > 1:
@@ -91,7 +91,7 @@ def _summary(rows: Sequence[Row]) -> dict[str, float | str | int]:
 
 
 def write_csv(rows: Sequence[Row], out: Path) -> None:
-    """Write `images.csv`, a line an image, and `table.csv`, a line a set."""
+    """Write `images.csv`, one line per image, and `table.csv`, one line per set."""
     with (out / "images.csv").open("w", newline="", encoding="utf-8") as file:
         lines = [
             {"set": row.image_set, "name": row.name, **row.overlap._asdict(), **_summary([row])}
@@ -134,7 +134,7 @@ def _write_sheet(rows: Sequence[Image], path: Path) -> None:
 
 
 def _write_picture(path: Path, image: Image) -> None:
-    """Write a picture as PNG. Raises OSError where the place does not take it."""
+    """Write a picture as PNG. Raises OSError if it cannot be written."""
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
@@ -145,19 +145,17 @@ def _parser() -> Parser:
         "marked",
         type=Path,
         nargs="?",
-        help="folder of hand-marked masks of the same names, or a bag with truth",
+        help="folder of hand-marked masks with the same names, or a bag with ground truth",
     )
-    parser.add_argument(
-        "--pictures", type=Path, metavar="FOLDER", help="the images themselves, for the sheet"
-    )
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="the images, for the sheet")
     parser.add_argument("--out", type=Path, default=Path("out/evaluate"), metavar="FOLDER")
     parser.add_argument(
         "--calibration",
         type=Path,
         metavar="FILE",
-        help="camera; without it a bag's own camera_info, and the paper's 90 x 90 degrees for folders",
+        help="camera; default: camera_info of the bag, or the paper's 90 x 90 degrees for folders",
     )
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="of a bag, every N-th image (1)")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image of a bag (1)")
     parser.add_argument("--camera-info-topic", default="/knee_gap/camera_info", metavar="TOPIC")
     parser.add_argument("--image-topic", default="/knee_gap/image_raw/compressed", metavar="TOPIC")
     parser.add_argument("--mask-topic", default="/knee_gap/gap_mask", metavar="TOPIC", help="predicted masks")
@@ -173,17 +171,17 @@ def _parser() -> Parser:
 
 
 def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
-    """The pairs that the arguments name. Raises PerceptionError."""
+    """Pairs of masks that the arguments name. Raises PerceptionError."""
     if arguments.every < 1:
         raise PerceptionError(f"--every must be at least 1, not {arguments.every}")
     if not is_bag(arguments.predicted):
         if arguments.marked is None:
             if not arguments.predicted.is_dir():
-                flaw = missing_bag(arguments.predicted) or f"{arguments.predicted} is no bag and no folder"
+                flaw = missing_bag(arguments.predicted) or f"{arguments.predicted} is not a bag or a folder"
                 raise PerceptionError(flaw)
             raise PerceptionError(
-                f"{arguments.predicted} is no bag, it holds no MCAP file: "
-                "name the folder of marked masks as well"
+                f"{arguments.predicted} is not a bag, it holds no MCAP file: "
+                "for a folder of masks, give the folder of marked masks as well"
             )
         return folder_pairs(arguments.predicted, arguments.marked, arguments.pictures)
     truth = arguments.marked or arguments.predicted
@@ -192,7 +190,7 @@ def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
 
 
 def _camera(arguments: argparse.Namespace) -> Camera | None:
-    """The camera that the arguments, or the bags, name. Raises PerceptionError for one that is none."""
+    """Camera named by the arguments or contained in the bags. Raises PerceptionError if it is not valid."""
     if arguments.calibration is not None:
         return load_calibration(arguments.calibration).require_camera().camera()
     for path in (arguments.marked, arguments.predicted):
@@ -204,7 +202,7 @@ def _camera(arguments: argparse.Namespace) -> Camera | None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate; 0 when everything was judged and written."""
+    """Evaluate; return 0 if all pairs were scored and written."""
     arguments = _parser().parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="evaluate: %(message)s", stream=sys.stderr)
     try:
@@ -225,7 +223,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _progress(pairs: Iterable[Pair], count: int) -> Iterator[Pair]:
-    """A bar on a terminal; a line at each tenth elsewhere."""
+    """Show a progress bar on a terminal, else one line per tenth."""
     if sys.stderr.isatty():
         yield from tqdm(pairs, total=count, desc="evaluating", unit="image")
         return

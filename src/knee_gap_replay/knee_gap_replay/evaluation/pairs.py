@@ -1,6 +1,6 @@
-"""What `evaluate` compares: pairs of a predicted and a true mask, from folders or from recorded bags.
+"""Pairs of a predicted and a true gap mask, from folders or from recorded bags.
 
-The truth of a bag is a topic of masks, or the scene of a simulated bag.
+The ground truth of a bag is a topic of masks, or the scene of a simulated bag.
 """
 
 import sys
@@ -29,7 +29,7 @@ MOST_PICTURE_BYTES = 256 << 20
 
 
 class Pair(NamedTuple):
-    """A predicted and a marked mask (h, w), the set and name they go by, and the picture if there is one."""
+    """A predicted and a marked mask (h, w), the names of their set and image, and the image if known."""
 
     image_set: str
     name: str
@@ -39,7 +39,7 @@ class Pair(NamedTuple):
 
 
 class BagTopics(NamedTuple):
-    """Where a bag has its images, predicted masks and true masks."""
+    """Topics of a bag's images, predicted masks and true masks."""
 
     image: str
     mask: str
@@ -47,14 +47,14 @@ class BagTopics(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a recorded bag rather than a folder of pictures."""
+    """Whether a path is a recorded bag, not a folder of pictures."""
     return path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
 def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[int, Iterator[Pair]]:
-    """Masks of two folders with the same name but for the suffix; a subfolder is a set of its own.
+    """Pairs of masks of two folders with the same name apart from the suffix; each subfolder is a set.
 
-    Raises PerceptionError for folders that are missing or share no name, and for files that are no images.
+    Raises PerceptionError if a folder is missing, if no name is in both, or if a file is not an image.
     """
     predictions, marks = _files(predicted), _files(marked)
     views = _files(pictures) if pictures else {}
@@ -62,7 +62,7 @@ def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[
     if not names:
         raise PerceptionError(f"no mask in {predicted} has the name of one in {marked}")
     if unpaired := len(predictions.keys() ^ marks.keys()):
-        print(f"evaluate: {unpaired} masks have no partner and are left out", file=sys.stderr)
+        print(f"evaluate: {unpaired} masks without a partner of that name are skipped", file=sys.stderr)
 
     def pairs() -> Iterator[Pair]:
         for name in names:
@@ -77,11 +77,11 @@ def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[
 def bag_pairs(
     predicted: Path, truth: Path, topics: BagTopics, segmentation: str | None, every: int
 ) -> tuple[int, Iterator[Pair]]:
-    """Masks of one bag against the truth of another, or of itself, by their stamps; every so many-th image.
+    """Pairs of masks of a bag and the ground truth of another, or of itself, with the same stamp.
 
-    Predicted are the masks recorded in the bag; where there are none, or a segmentation is named, its images
-    are segmented here, as segmentation_node does. Raises PerceptionError for topics that are not in the bag
-    and for a bag whose truth nobody knows.
+    `every` is the step between images. The predicted masks are those recorded in the bag. If there are none,
+    or if a segmentation is named, its images are segmented here as in segmentation_node. Raises
+    PerceptionError for topics that are not in the bag and for a bag without ground truth.
     """
     bag, marked = CalibrationBag(predicted), truth_of(truth, topics.truth)
     recorded = segmentation is None and bag.has(topics.mask)
@@ -110,7 +110,7 @@ def bag_pairs(
 
 
 def truth_of(bag: Path, topic: str) -> MaskAt:
-    """True mask at a stamp [ns], None where there is none; raises PerceptionError where nobody knows any."""
+    """True mask at a stamp [ns], None if there is none. Raises PerceptionError for a bag without any."""
     source = CalibrationBag(bag)
     if source.has(topic):
         packed = {s: (np.packbits(image[..., 0] > 127), image.shape[:2]) for s, image in source.images(topic)}
@@ -124,11 +124,11 @@ def truth_of(bag: Path, topic: str) -> MaskAt:
         return recorded
     if (masks := gap_masks(bag)) is not None:
         return masks
-    raise PerceptionError(f"{bag} has no truth: no topic {topic}, and it is not simulated")
+    raise PerceptionError(f"{bag} has no ground truth: it has no topic {topic}, and it is not simulated")
 
 
 def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[int, Image]:
-    """The pictures that a sheet shows, by stamp; none where the bag has no images."""
+    """Images for the sheet by stamp; empty if the bag has none."""
     if not bag.has(topic):
         return {}
     return dict(islice(((s, image) for s, image in bag.images(topic) if s in wanted), SHEET_ROWS))
@@ -136,7 +136,7 @@ def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[i
 
 def _files(folder: Path) -> dict[Path, Path]:
     if not folder.is_dir():
-        raise PerceptionError(f"{shown(folder)} is no folder")
+        raise PerceptionError(f"{shown(folder)} is not a folder")
     return {
         path.relative_to(folder).with_suffix(""): path
         for path in sorted(folder.rglob("*"))
@@ -151,11 +151,11 @@ def _image(path: Path) -> Image:
         raise PerceptionError(str(error)) from None
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if image is None:
-        raise PerceptionError(f"{path} is no image that can be read")
+        raise PerceptionError(f"{path} cannot be read as an image")
     return np.asarray(image, dtype=np.uint8)
 
 
 def _mask(path: Path) -> Mask:
-    """The gap is what is brighter than half; in masks of 0 and 1, what is 1."""
+    """Mask of the gap: pixels brighter than half, or equal to 1 in masks of 0 and 1."""
     image = _image(path).max(axis=2)
     return np.asarray(image > (0 if image.max() <= 1 else 127))

@@ -1,6 +1,6 @@
-"""Bags to calibrate a scope with, whose truth is known: board, turned scope, pivoting.
+"""Simulated calibration recordings with ground truth: board, rotated scope, pivoting.
 
-Three steps are recorded one after the other, and a topic says where each begins, as a lab can with
+The three steps are recorded one after the other. A topic marks the start of each, as a laboratory can do with
 `ros2 topic pub --once /knee_gap/calibration_step std_msgs/msg/String "data: board"`.
 """
 
@@ -49,9 +49,9 @@ LENSES: dict[str, Lens] = {"equidistant": Lens(), "pinhole": PinholeLens()}
 
 @dataclass(frozen=True)
 class CalibrationRecording:
-    """What to record, with a board of BOARDS and a lens of LENSES, which is as air has it, in `medium`.
+    """Settings of a recording: a board of BOARDS, and a lens of LENSES (as it is in air), used in `medium`.
 
-    `video_delay` [s]: how late images are stamped, so that the time offset is minus it.
+    `video_delay` [s] is the delay of the images' stamps; the time offset is its negative.
     """
 
     seed: int = 7
@@ -67,7 +67,7 @@ class CalibrationRecording:
     medium: Medium = "air"
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values for JSON; the medium where it is not air."""
+        """Settings as plain values for JSON; the medium is left out if it is air."""
         values = asdict(self)
         if self.medium == "air":
             del values["medium"]
@@ -92,7 +92,7 @@ class CalibrationRecording:
 
 @dataclass(frozen=True)
 class CalibrationTruth:
-    """What a calibration of the bag should find; `lens` is that in the recording's medium."""
+    """True values of the calibration; `lens` is the lens in the recording's medium."""
 
     lens: Lens
     scope: RotatedScope
@@ -103,7 +103,7 @@ class CalibrationTruth:
     time_offset: float
 
     def as_dict(self) -> dict[str, Any]:
-        """The truth in plain numbers; transforms as translation [m] and quaternion."""
+        """Ground truth as plain numbers; transforms as translation [m] and quaternion."""
         shaft = self.scope.scope.body_to_shaft()
         return {
             "lens": asdict(calibrated(self.lens)),
@@ -121,7 +121,7 @@ class CalibrationTruth:
 
 
 def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
-    """A scope assembled as the seed has it: lens, body and shaft are never where the drawing says."""
+    """A scope with assembly errors drawn from the seed: lens, body and shaft deviate from the drawing."""
     rng = np.random.default_rng([recording.seed, 0x4341])
     nominal, lens = Scope(), LENSES[recording.lens]
     scope = replace(
@@ -152,14 +152,13 @@ def calibration_truth(recording: CalibrationRecording) -> CalibrationTruth:
 
 
 class CalibrationMotion:
-    """Where lens and body are at any time [s]: the board looked at from all sides, then the shaft turned."""
+    """Poses of lens and body over time [s]: views of the board from all sides, then rotation of the shaft."""
 
     def __init__(self, recording: CalibrationRecording, truth: CalibrationTruth) -> None:
         self._recording, self._truth = recording, truth
         rng = np.random.default_rng([recording.seed, 0x4D4F])
-        # Slow sweeps to the sides, up and down, about the view, near and far; on top the shaking of a hand
-        # that was told to shake, and its tremor. Each is a few waves an axis: three turns [rad], three
-        # shifts [m].
+        # Slow sweeps to the sides, up and down, about the view, near and far, plus deliberate shaking of the
+        # hand and its tremor. Each is a few sine waves per axis: three rotations [rad], three shifts [m].
         self._waves = [
             _Waves(rng, (0.09, 0.22), 1, [0.32, 0.32, 0.42, 0.0042, 0.0035, 0.0042]),
             _Waves(rng, (0.8, 3.5), 5, [0.016, 0.016, 0.02, 0.0005, 0.0005, 0.0006]),
@@ -169,21 +168,21 @@ class CalibrationMotion:
 
     @property
     def board_end(self) -> float:
-        """When the scope begins to be turned [s]."""
+        """Time at which the rotation of the scope starts [s]."""
         return self._recording.board_s
 
     @property
     def image_end(self) -> float:
-        """When the last image is taken and pivoting begins [s]."""
+        """Time of the last image, at which pivoting starts [s]."""
         return self._recording.board_s + self._recording.oblique_s
 
     @property
     def end(self) -> float:
-        """When the recording ends [s]."""
+        """End of the recording [s]."""
         return self.image_end + self._recording.pivot_s
 
     def turn(self, time: float) -> float:
-        """Turn of the shaft in the camera head [rad]."""
+        """Rotation of the shaft in the camera head [rad]."""
         since = time - self.board_end
         if since <= 0 or self._recording.oblique_s == 0:
             return 0.0
@@ -217,10 +216,10 @@ def make_calibration_bag(
     recording: CalibrationRecording | None = None,
     progress: Callable[[Iterator[float], int], Iterator[float]] = lambda times, _: times,
 ) -> CalibrationTruth:
-    """Render a calibration recording into a new bag and return its truth, which its metadata carry too.
+    """Render a calibration recording into a new bag; return its ground truth, which its metadata contain too.
 
-    `progress` wraps the exposure times, of which it is told the number. Raises SimulationError for a
-    recording that cannot be made and BagError where the bag cannot be written.
+    `progress` wraps the exposure times and receives their number. Raises SimulationError for settings that
+    cannot be simulated and BagError if the bag cannot be written.
     """
     chosen = recording or CalibrationRecording()
     truth = calibration_truth(chosen)
@@ -235,7 +234,7 @@ def make_calibration_bag(
             bag.add_topic(topic, "geometry_msgs/msg/PoseStamped", "sensor")
         bag.add_topic(STEP, "std_msgs/msg/String", "reliable")
         messages = [*_steps(motion, chosen), *_poses(motion, chosen, truth)]
-        # Few and small beside the images, which are written as they are rendered.
+        # Few and small compared with the images, which are written as they are rendered.
         messages.sort(key=lambda entry: entry[0])
         for record_ns, topic, message in _merged(messages, _images(motion, chosen, truth, progress)):
             bag.write(topic, message, record_ns)
@@ -243,7 +242,7 @@ def make_calibration_bag(
 
 
 class _Waves:
-    """Six smooth signals of given RMS, each of a few sine waves in a band."""
+    """Six smooth signals of given RMS, each the sum of a few sine waves in a band."""
 
     def __init__(
         self, rng: np.random.Generator, band_hz: tuple[float, float], count: int, rms: list[float]
@@ -292,7 +291,7 @@ def _poses(
     T_body_lens = truth.scope.body_to_lens(0.0)
     rng = np.random.default_rng([recording.seed, 0x5452])
     reported = tracked_body(true @ T_body_lens, T_body_lens, recording.noise, rng)
-    # A second body, on the light post: it turns with the scope, the first stays with the camera head.
+    # The second body, on the light post, rotates with the scope; the first is fixed to the camera head.
     shaft = truth.scope.scope.body_to_shaft()
     post = shaft @ from_rotation_vectors([0.3, 0.2, 0.1], [0.04, 0.0, -0.15])
     turns = np.array([motion.turn(time) for time in times])
@@ -324,7 +323,7 @@ def _images(
         message.format = "bgr8; jpeg compressed bgr8"
         message.data = np.frombuffer(jpeg(camera.frame(T_board_lens, turn), recording.quality), np.uint8)
         yield record_ns, IMAGE, message
-        # The truth carries the tracker's time of the exposure, not the image's late stamp.
+        # The ground truth has the exposure time by the tracker's clock, not the delayed stamp of the image.
         yield record_ns, LENS_POSE_TRUE, pose_message(truth.T_world_board @ T_board_lens, _stamp_ns(time))
 
 

@@ -1,4 +1,4 @@
-"""A calibration board on a speckled table, seen by a scope that may be turned in its camera head."""
+"""Images of a calibration board on a speckled table, seen by a scope that can rotate in its camera head."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -19,12 +19,12 @@ ByteImage = npt.NDArray[np.uint8]
 TEXTURE_PX_PER_M = 26_000  # 0.038 mm: about a pixel of the picture at the working distance
 TABLE_MARGIN = 0.030  # [m] of table around the board
 WORKING_DISTANCE = 0.024
-NOISE_FRAMES = 6  # drawn once, then rolled at random: drawing is the slowest part of a picture
+NOISE_FRAMES = 6  # generated once, then rolled at random: noise is the slowest part of an image
 TINT_BGR = (0.86, 0.93, 1.0)
 
 
 class Board(Protocol):
-    """What the scene asks of a board, whose frame has x along its columns, y along its rows [m]."""
+    """Interface of a board. Its frame has x along the columns and y along the rows [m]."""
 
     @property
     def text(self) -> str:
@@ -114,19 +114,19 @@ class ChessBoard:
         table = _table((height + 2 * margin, width + 2 * margin), scale, rng)
         ink = board.generateImage((width, height), marginSize=0)
         table[margin : margin + height, margin : margin + width] = np.where(ink > 127, 0.85, 0.07)
-        # A pixel of the texture is centred half a pixel from its edge, at which the board begins.
+        # The board starts at the edge of the texture's first pixel, half a pixel from its centre.
         return cv2.GaussianBlur(table, (0, 0), 0.7).astype(np.float32), scale, np.full(2, margin - 0.5)
 
 
 @dataclass(frozen=True)
 class RotatedScope:
-    """A scope whose shaft turns in the camera head, which carries the tracked body."""
+    """A scope whose shaft rotates in the camera head, to which the tracked body is fixed."""
 
     scope: Scope = field(default_factory=Scope)
-    notch_angle: float = np.radians(-90.0)  # in the picture, from x towards y, at turn 0
+    notch_angle: float = np.radians(-90.0)  # in the image, from x towards y, at rotation 0
 
     def body_to_lens(self, turn: float) -> Array:
-        """``T_body_lens`` (4, 4): the tip turned about the shaft, the axes staying with the sensor."""
+        """``T_body_lens`` (4, 4) at a rotation about the shaft; its axes stay with the sensor."""
         shaft = self.scope.body_to_shaft()
         tilt = from_rotation_vectors([self.scope.oblique_angle, 0.0, 0.0], np.zeros(3))
         tip = shaft @ from_rotation_vectors([0.0, 0.0, turn], np.zeros(3)) @ tilt
@@ -136,7 +136,7 @@ class RotatedScope:
 
 
 class BoardCamera:
-    """Pictures of the board through the lens, with its light at the tip, noise and the notch."""
+    """Renders images of the board through the lens, with the light at its tip, noise and the notch."""
 
     def __init__(self, board: Board, lens: Lens, scope: RotatedScope, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 0x4243])
@@ -153,7 +153,7 @@ class BoardCamera:
         self._noise = self._rng.standard_normal((NOISE_FRAMES, *self._stop.shape), dtype=np.float32)
 
     def frame(self, T_board_lens: Array, turn: float) -> ByteImage:
-        """The picture (h, w, 3). Raises SimulationError where the lens is not in front of the board."""
+        """Image (h, w, 3). Raises SimulationError if the lens is not in front of the board."""
         origin, rotation = T_board_lens[:3, 3].astype(np.float32), T_board_lens[:3, :3].astype(np.float32)
         if origin[2] >= 0:
             raise SimulationError(f"the lens must be in front of the board (z < 0), not at z = {origin[2]} m")
@@ -170,7 +170,7 @@ class BoardCamera:
             borderMode=cv2.BORDER_REFLECT,
         )
         shade = (np.float32(WORKING_DISTANCE) / depth) ** 2 * towards
-        # Automatic exposure: the bright parts of the picture end up at the same level.
+        # Automatic exposure: it keeps the bright parts of the image at the same level.
         shade /= max(1e-6, float(np.percentile(shade[::16, ::16][self._stop[::16, ::16] > 0.5], 80)))
         light = cv2.GaussianBlur(light * shade, (0, 0), 0.8) * self._stop_at(turn)
         noise = np.roll(self._noise[self._rng.integers(NOISE_FRAMES)], self._rng.integers(len(light)), axis=0)
@@ -181,5 +181,5 @@ class BoardCamera:
         return image
 
     def _stop_at(self, turn: float) -> npt.NDArray[np.float32]:
-        """Share of light that passes the field stop."""
+        """Fraction of the light that passes the field stop."""
         return np.asarray(self._stop * self._notch.light(self._scope.notch_angle + turn))

@@ -1,1 +1,1 @@
-"""A knee of known gap: scene, camera, difficulty, ground truth."""
+"""The simulated knee of known gap: scene, camera, difficulty, ground truth."""

@@ -1,4 +1,4 @@
-"""The camera head of the bench: focus, shutter, bloom, exposure, noise and the processor's sharpening."""
+"""The camera head of the knee simulator: focus, shutter, bloom, exposure, noise and sharpening."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ _TONE = tone_table()
 
 
 def focus_blur(image: FloatImage, lengths: Array, defocus_px: float) -> FloatImage:
-    """The image (h, w, 3) with what lies out of focus blurred; ``defocus_px`` at half the focal distance."""
+    """The image (h, w, 3) with defocus blur: ``defocus_px`` at half the focal distance."""
     if defocus_px <= 0.0:
         return image
     off = np.abs(FOCAL_DISTANCE / np.nan_to_num(lengths, nan=1.0) - 1.0)
@@ -33,7 +33,7 @@ def focus_blur(image: FloatImage, lengths: Array, defocus_px: float) -> FloatIma
 
 
 def motion_blur(image: FloatImage, shift_px: Array) -> FloatImage:
-    """The image (h, w, 3) smeared along a shift (2,) [px] that it makes while the shutter is open."""
+    """The image (h, w, 3) with motion blur: a shift (2,) [px] while the shutter is open."""
     length = float(np.hypot(*shift_px))
     if length < 0.5:
         return image
@@ -50,7 +50,7 @@ def motion_blur(image: FloatImage, shift_px: Array) -> FloatImage:
 
 
 class CameraHead:
-    """Turns linear light into display images, frame after frame."""
+    """Converts linear light to display images, frame by frame."""
 
     def __init__(
         self, conditions: Conditions, stop: FloatImage, radius: npt.NDArray[np.float32], seed: int
@@ -71,7 +71,7 @@ class CameraHead:
             exposed += conditions.bloom * _bloom(exposed)
         exposed *= falloff[..., None]
         rng = np.random.default_rng([self._seed, 0x4E4F, frame])
-        # Amplified light brings its noise with it.
+        # Gain amplifies the noise of the light with it.
         amplified = float(np.clip(gain, 0.5, 6.0))
         variance = conditions.shot_noise**2 * amplified * exposed + (conditions.read_noise * amplified) ** 2
         noise = rng.standard_normal(exposed.shape, dtype=np.float32)
@@ -86,7 +86,7 @@ class CameraHead:
 
 
 def _bloom(exposed: FloatImage) -> FloatImage:
-    """Light that spills from what is too bright, at a quarter of the size."""
+    """Light that spills from overexposed pixels, computed at a quarter of the size."""
     small = cv2.resize(exposed, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     excess = np.clip(small - 0.8, 0.0, 4.0)
     spilt = cv2.GaussianBlur(excess, (0, 0), 3.0) + 0.6 * cv2.GaussianBlur(excess, (0, 0), 12.0)

@@ -1,4 +1,4 @@
-"""How hard a picture is: one level from 0 (easy) to 3 for each thing that makes a knee hard to see."""
+"""Difficulty of a simulated image: a level from 0 (easy) to 3 for each cause."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -10,13 +10,12 @@ LEVELS = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Levels 0-3 of each difficulty.
+    """Level 0-3 of each difficulty.
 
-    texture: how nearly uniform the cartilage is. relief: how uneven bone and rim are, and how frayed.
-    glare: mirror reflections and their bloom. light: vignette, narrow beam, slow exposure. motion: tremor
-    and the shutter's motion blur. focus: softness of the lens and what lies out of focus. turbidity:
-    absorption, veil and wisps of blood. debris: drifting shreds. probe: a probe that covers an edge. noise:
-    sensor noise and JPEG.
+    texture: uniformity of the cartilage. relief: unevenness of bone and rim, and fraying. glare: specular
+    reflections and their bloom. light: vignette, narrow beam, slow exposure. motion: tremor and motion blur.
+    focus: softness of the lens and defocus. turbidity: absorption, veil and wisps of blood. debris: drifting
+    shreds. probe: a probe that covers an edge. noise: sensor noise and JPEG.
     """
 
     texture: int = 0
@@ -39,7 +38,7 @@ class Difficulty:
 
     @staticmethod
     def at(level: int, but: Mapping[str, int] | None = None) -> "Difficulty":
-        """Everything at one level, but for single hardnesses by name."""
+        """All difficulties at one level, except those given by name."""
         names = [field.name for field in fields(Difficulty)]
         if unknown := sorted(set(but or {}) - set(names)):
             raise SimulationError(f"there is no difficulty '{unknown[0]}'; there are {', '.join(names)}")
@@ -48,7 +47,7 @@ class Difficulty:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a difficulty means, in numbers. Lengths [m], times [s], angles [rad]; ``_px`` in pixels."""
+    """Numbers behind a difficulty. Lengths [m], times [s], angles [rad]; ``_px`` in pixels."""
 
     # tissue
     contrast: float  # of the cartilage's texture, 1 = rich
@@ -56,7 +55,7 @@ class Conditions:
     # light
     glare: float
     bloom: float
-    vignette: float  # share of light lost at the rim of the picture
+    vignette: float  # fraction of the light lost at the rim of the image
     beam: float  # exponent of the lamp's fall-off to the side
     exposure_lag_s: float
     # hand and optics
@@ -81,7 +80,7 @@ PROBE_PERIOD_S = 4.0
 
 
 def conditions(difficulty: Difficulty) -> Conditions:
-    """The numbers behind the levels; each grows with its level and touches nothing else."""
+    """Numbers behind the levels; each increases with its own level only."""
     visits: tuple[tuple[tuple[float, float], ...], ...] = (
         (),
         ((1.9, 2.6),),

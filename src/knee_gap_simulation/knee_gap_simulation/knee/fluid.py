@@ -1,4 +1,4 @@
-"""What floats between lens and tissue: turbid saline, wisps of blood, drifting shreds."""
+"""The fluid between lens and tissue: turbid saline, wisps of blood, drifting shreds."""
 
 from dataclasses import dataclass
 
@@ -21,14 +21,14 @@ _BOX_CENTRE = np.array([0.0, 0.0, -0.004])
 
 
 class Turbidity:
-    """A veil that light scatters back from the fluid, and wisps that drift through the picture."""
+    """The veil of light scattered back by the fluid, and wisps of blood that drift through the image."""
 
     def __init__(self, veil: float, wisps: float, shape: tuple[int, ...], seed: int) -> None:
         self._veil, self._wisps, self._shape = veil, wisps, shape
         rng = np.random.default_rng([seed, 0x5455])
         self._cloud = band_noise(rng, (2.0, 14.0), slope=1.6, size_px=256)
         y, x = np.meshgrid(*(np.linspace(-1.0, 1.0, side) for side in shape), indexing="ij")
-        # The lamp lights the fluid most in the middle of the picture.
+        # The lamp lights the fluid most in the middle of the image.
         self._beam = (1.0 - 0.55 * np.clip(x**2 + y**2, 0.0, 1.0)).astype(np.float32)
         self._drift = rng.uniform(-14.0, 14.0, 2)
 
@@ -46,7 +46,7 @@ class Turbidity:
         return np.asarray(result, dtype=np.float32)
 
     def _wisp_cover(self, time: float, lens: Array) -> FloatImage:
-        # Wisps hang a few millimetres before the lens: they pass through the picture as it moves.
+        # Wisps are a few millimetres in front of the lens: they cross the image as it moves.
         shift = self._drift * time - 9e3 * lens[:2]
         size = 120
         y, x = np.mgrid[0:size, 0:size].astype(np.float32)
@@ -103,10 +103,10 @@ class Debris:
         corner_px: tuple[int, int],
         softness_px: float,
     ) -> tuple[FloatImage, FloatImage]:
-        """The image (h, w, 3) with the shreds before it, and the share (h, w) of each pixel that they cover.
+        """The image (h, w, 3) with shreds in front, and the fraction (h, w) of each pixel that they cover.
 
-        ``lengths`` (h, w) of the rays tell what lies behind tissue; ``corner_px`` (row, column) is the
-        place of the image in the full picture.
+        ``lengths`` (h, w) of the rays determine which shreds are behind tissue; ``corner_px`` (row, column)
+        is the position of the image in the full image.
         """
         result, cover = image.copy(), np.zeros(image.shape[:2], np.float32)
         for shred in self._shreds:
@@ -118,7 +118,7 @@ class Debris:
             if far < 1.5e-3 or not np.isfinite(centre).all():
                 continue
             scale = lens.focal_px / far
-            # The lens focuses beyond the shreds: near ones are large, soft and thin.
+            # The lens is focused beyond the shreds: near ones are large, blurred and faint.
             soft = softness_px * (1.0 + 4.0 * abs(0.010 / far - 1.0))
             light = min(3.0, (0.010 / far) ** 2) * float(in_lens[2] / far) ** 2
             width = shred.width * scale
@@ -166,7 +166,7 @@ def _paint(
                 continue
             dx, dy = column - x_px, row - y_px
             along, across = cos * dx + sin * dy, -sin * dx + cos * dy
-            # A parabola for a spine, thinner to its ends.
+            # The spine is a parabola, thinner towards its ends.
             share = along / (0.5 * length_px)
             across -= bend * 0.25 * length_px * (share * share - 0.3)
             over = max(0.0, abs(share) - 1.0) * 0.5 * length_px

@@ -1,4 +1,4 @@
-"""Surface points of the knee, and where the same points are in later frames."""
+"""Ground truth of the knee: surface points behind pixels, and their positions in later frames."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from knee_gap_simulation.knee.scene import KneeScene
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_simulation.surfaces.distance_field import CONDYLE, MENISCUS, PROBE
 
-# A point is seen if its ray ends this close to it [m]: what hides it lies farther before it.
+# A point is visible if its ray ends this close to it [m]: whatever hides it is farther in front.
 _SAME_POINT = 30e-6
-# How far around a point its nearest edge is looked for.
+# Radius around a point within which its nearest edge is searched.
 EDGE_REACH_PX = 80.0
 _DIRECTIONS = 64
 _RING_PX = 3.0
 
 
 class Visibility(IntEnum):
-    """Whether a surface point is seen in a frame, or why not."""
+    """Whether a surface point is visible in a frame, or why not."""
 
     VISIBLE = 0
     OUT_OF_VIEW = 1
@@ -31,7 +31,7 @@ class Visibility(IntEnum):
 
 
 class EdgeKind(IntEnum):
-    """The nearest edge of the gap, with the values of knee_gap_msgs/GapEdges."""
+    """Kind of the nearest edge of the gap, with the values of knee_gap_msgs/GapEdges."""
 
     UNKNOWN = 0
     RIM = 1
@@ -40,7 +40,7 @@ class EdgeKind(IntEnum):
 
 
 class SurfacePoints(NamedTuple):
-    """Points (n, 3) in the world [m], unit normals (n, 3) of their surfaces (n,), 255 for no surface."""
+    """Points (n, 3) in the world [m], unit normals (n, 3), and their surfaces (n,), 255 for none."""
 
     points: Array
     normals: Array
@@ -50,10 +50,10 @@ class SurfacePoints(NamedTuple):
 class PointObservations(NamedTuple):
     """The same n points in one frame.
 
-    pixels (n, 2): where they are, seen or hidden; NaN out of the field of view. visibility (n,).
-    contour_offset_px (n,): distance to the nearest edge of the gap as this frame shows it without probe and
-    debris, negative for a pixel inside the gap; NaN beyond 80 px. contour_offset (n,): the same as an angle
-    [rad]. edge_kinds (n,): of that edge.
+    pixels (n, 2): positions, visible or hidden; NaN outside the field of view. visibility (n,).
+    contour_offset_px (n,): distance to the nearest edge of the gap in this frame without probe and debris,
+    negative for a pixel inside the gap; NaN beyond 80 px. contour_offset (n,): the same as an angle [rad].
+    edge_kinds (n,): kind of that edge.
     """
 
     pixels: Array
@@ -64,7 +64,7 @@ class PointObservations(NamedTuple):
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
-        """Whether each point (n,) is seen."""
+        """Whether each point (n,) is visible."""
         return np.asarray(self.visibility == Visibility.VISIBLE)
 
 
@@ -76,7 +76,7 @@ def surface_points(
     probe: Array,
     pixels: npt.ArrayLike,
 ) -> SurfacePoints:
-    """What pixels (n, 2) [px] of a frame show; NaN out of the field of view."""
+    """Surface points behind pixels (n, 2) [px] of a frame; NaN outside the field of view."""
     bearings = lens.bearings(np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
     T_scene_lens = inverse(T_world_scene) @ T_world_lens
     turn = T_world_scene[:3, :3]
@@ -95,9 +95,9 @@ def follow(
     *,
     edges: bool = True,
 ) -> PointObservations:
-    """Where surface points are in a frame with a true lens pose, a probe and debris.
+    """Positions of surface points in a frame with a true lens pose, a probe and debris.
 
-    ``edges`` False leaves out the nearest edges (NaN, UNKNOWN), which take most of the time.
+    If ``edges`` is False, the nearest edges are left out (NaN, UNKNOWN); they take most of the time.
     """
     T_scene_lens = inverse(T_world_scene) @ T_world_lens
     T_lens_world = inverse(T_world_lens)
@@ -124,7 +124,7 @@ def nearest_edge(scene: KneeScene, lens: Lens, T_scene_lens: Array, pixel: Array
     angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     inside = bool(scene.looks_into_gap(T_scene_lens, lens.bearings(pixel[None]))[0])
-    # Rings outwards until one meets the other side; the edge lies between it and the ring before.
+    # Search in growing rings until one meets the other side; the edge lies between it and the last ring.
     for radius in np.arange(_RING_PX, EDGE_REACH_PX + _RING_PX, _RING_PX):
         ring = scene.looks_into_gap(T_scene_lens, lens.bearings(pixel + radius * spokes)) != inside
         if ring.any():
@@ -152,7 +152,7 @@ def nearest_edge(scene: KneeScene, lens: Lens, T_scene_lens: Array, pixel: Array
 def _kind(scene: KneeScene, lens: Lens, T_scene_lens: Array, tissue_side: Array, gap_side: Array) -> EdgeKind:
     bearings = lens.bearings(np.stack([tissue_side, gap_side]))
     _, _, surfaces, lengths = scene.cast(T_scene_lens[:3, 3], bearings @ T_scene_lens[:3, :3].T, exact=False)
-    # Where the surface goes on behind the edge, only the light ends there.
+    # If the surface continues behind the edge, it is the edge of a shadow.
     if not lengths[1] > 1.05 * lengths[0]:
         return EdgeKind.SHADING
     return {CONDYLE: EdgeKind.CONTOUR, MENISCUS: EdgeKind.RIM}.get(int(surfaces[0]), EdgeKind.CONTOUR)

@@ -1,4 +1,4 @@
-"""Pictures of the knee under given conditions."""
+"""Renderer of images of the knee at a given difficulty."""
 
 from typing import NamedTuple
 
@@ -18,10 +18,10 @@ from knee_gap_simulation.surfaces.shading import Light, shade
 
 
 class KneeLight(NamedTuple):
-    """What falls on the sensor, in the box around the picture, and what it comes from.
+    """Light on the sensor, in the box around the field of view, with its ground truth.
 
     light (h, w, 3): linear, blue green red. gap_mask (height, width): the pixels of the whole image that
-    look into the gap. debris_cover (height, width): how much of each pixel debris covers.
+    look into the gap. debris_cover (height, width): fraction of each pixel that debris covers.
     """
 
     light: FloatImage
@@ -30,7 +30,7 @@ class KneeLight(NamedTuple):
 
 
 class KneeCamera:
-    """Renders pictures of a knee in order of time."""
+    """Renders images of a knee in order of time."""
 
     def __init__(
         self, scene: KneeScene, lens: Lens, conditions: Conditions, seed: int, workers: int = 2
@@ -42,7 +42,7 @@ class KneeCamera:
         self._stop = np.ascontiguousarray(stop[self._box])
         offset = lens.pixel_grid()[self._box] - (lens.centre_x_px, lens.centre_y_px)
         radius = np.hypot(offset[..., 0], offset[..., 1]) / lens.radius_px
-        # The soft border of the stop shows what lies at the rim of the field of view.
+        # Pixels on the soft border of the stop show the rim of the field of view.
         shrink = np.where(self._stop > 0.0, np.minimum(1.0, (1.0 - 1e-9) / np.maximum(radius, 1e-9)), 1.0)
         centre = np.array([lens.centre_x_px, lens.centre_y_px])
         self._bearings = lens.bearings(centre + offset * shrink[..., None])
@@ -64,9 +64,9 @@ class KneeCamera:
         self._head = CameraHead(conditions, self._stop, radius.astype(np.float32), seed)
 
     def light(self, T_scene_lens: Array, time: float, shift_px: Array, probe: Array | None) -> KneeLight:
-        """What falls on the sensor from a lens pose at a time [s]; may be called from several threads.
+        """Light on the sensor for a lens pose at a time [s]; may be called from several threads.
 
-        ``shift_px`` (2,) is how far the middle of the picture moves while the shutter is open.
+        ``shift_px`` (2,) is the shift of the centre of the image while the shutter is open.
         """
         lamp = T_scene_lens[:3, :3] @ np.asarray(self._light.position) + T_scene_lens[:3, 3]
         seen = self._mapper.map(T_scene_lens, lamp, probe)
@@ -105,9 +105,9 @@ class KneeCamera:
         return KneeLight(light, mask, debris_cover)
 
     def develop(self, light: KneeLight, frame: int, step_s: float) -> ByteImage:
-        """The picture (height, width, 3) bgr8 of light; in order of time, as the exposure follows.
+        """Image (height, width, 3) bgr8 of light. Call in order of time, since the exposure is controlled.
 
-        ``frame`` seeds its noise, ``step_s`` is the time since the last picture.
+        ``frame`` seeds its noise, ``step_s`` is the time since the last image.
         """
         image = np.zeros((self._lens.height_px, self._lens.width_px, 3), np.uint8)
         image[self._box] = self._head.develop(light.light, frame, step_s)

@@ -1,4 +1,4 @@
-"""The surgeon's probe: a slender hook that comes in, covers a place for a while, and leaves."""
+"""The surgeon's probe: a slender hook that enters, covers a place for some time, and leaves."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,7 +21,7 @@ class Probe:
 
     visits: tuple[tuple[float, float], ...]
     places: tuple[tuple[float, float, float], ...]
-    side: float  # -1 or 1: from which side of the picture it comes
+    side: float  # -1 or 1: the side of the image from which it enters
 
     def as_dict(self) -> dict[str, Any]:
         """The probe as plain values for JSON."""

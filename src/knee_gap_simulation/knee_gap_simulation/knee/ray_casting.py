@@ -1,4 +1,4 @@
-"""Every pixel's surface point from few rays: a coarse grid of rays, filled in where the surface is smooth."""
+"""Surface point of every pixel by ray casting: a coarse grid of rays, interpolated on smooth surfaces."""
 
 from typing import NamedTuple
 
@@ -13,18 +13,18 @@ from knee_gap_simulation.surfaces import distance_field as fields
 Bytes = npt.NDArray[np.uint8]
 NOTHING = np.uint8(255)
 SPACING_PX = 4
-# A cell is filled in from its corners if they lie on one surface, seen well, and almost in one plane.
+# A cell is interpolated if its corners lie on one surface, are clearly visible and almost in one plane.
 _LEAST_FACING = 0.12
 _MOST_STRETCH = 1.10
 _LEAST_AGREEMENT = 0.985
-# The joint's wall is rough, far and dark: coarser will do.
+# The joint's wall is rough, far and dark: a coarser tolerance is enough.
 _LEAST_AGREEMENT_OF_WALL = 0.93
 # Side of the blocks whose cones are tried first, in coarse cells.
 _BLOCK = 4
 
 
 class SurfaceMap(NamedTuple):
-    """What every pixel (h, w) shows: length of its ray, surface, normal, light from lamp and all around."""
+    """Surface behind every pixel (h, w): ray length, surface, normal, light of the lamp and ambient light."""
 
     lengths: Array
     surfaces: Bytes
@@ -47,7 +47,7 @@ class SurfaceMapper:
         self._constants, self._waves = scene.constants(), scene.wave_array()
 
     def map(self, T_scene_lens: Array, lamp: Array, probe: Array | None = None) -> SurfaceMap:
-        """The surfaces that all pixels show from a lens pose, lit from ``lamp`` (3,) in the scene."""
+        """Surfaces behind all pixels at a lens pose, lit from ``lamp`` (3,) in the scene."""
         rods = NO_PROBE if probe is None else probe
         origin, turn = np.ascontiguousarray(T_scene_lens[:3, 3]), T_scene_lens[:3, :3]
         free = np.empty(len(self._cones))
@@ -110,7 +110,7 @@ def _cones(bearings: Array) -> tuple[Array, float, npt.NDArray[np.int64]]:
     seen = np.isfinite(flat[:, 0])
     sums = np.zeros((cone_of.max() + 1, 3))
     np.add.at(sums, cone_of[seen], flat[seen])
-    # A block out of view has no cone; any axis will do for it.
+    # A block outside the field of view has no cone; its axis does not matter.
     sums[~sums.any(axis=1)] = (0.0, 0.0, 1.0)
     axes = sums / np.linalg.norm(sums, axis=1)[:, None]
     cosine = np.einsum("ij,ij->i", axes[cone_of], flat)[seen].min()
@@ -132,7 +132,7 @@ def _fill(
     reach: Array,
     starts: Array,
 ) -> None:
-    """Fill in the cells whose corners agree; elsewhere say from where each pixel's own ray must start."""
+    """Interpolate the cells whose corners agree; for the others return the start of each pixel's ray."""
     last_row, last_column = rows.shape[0] - 2, columns.shape[0] - 2
     for i in range(last_row + 1):
         for j in range(last_column + 1):

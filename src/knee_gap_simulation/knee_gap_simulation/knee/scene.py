@@ -1,4 +1,4 @@
-"""A knee whose gap is known: condyle, plateau, meniscus and the joint's wall behind.
+"""The scene of a knee of known gap: condyle, plateau, meniscus and the wall of the joint behind.
 
 Scene frame: x along the gap, y across it (the femur at negative y), z away from the lens; the origin lies
 in the middle of the gap, at the depth of the sharp rim of the meniscus. The upper edge of the dark gap is
@@ -23,14 +23,14 @@ KIND = "knee"
 NO_PROBE = np.zeros((0, 4))
 ANY = -1
 
-# The nearest distance is that within this of the middle of the gap, where an instrument passes.
+# The nearest distance is searched within this distance of the middle of the gap, where an instrument passes.
 NEAREST_WITHIN = 0.006
 
 # A closed joint: the condyle rests on the meniscus.
 CLOSED = -0.0012
-# What is seen deeper than this behind the rim is seen through the gap.
+# A point deeper than this behind the rim is seen through the gap.
 _BEHIND = 0.0035
-# How far from the middle of the gap [m] an edge of it is looked for.
+# Distance from the middle of the gap within which its edges are searched [m].
 _EDGE_WITHIN = 0.018
 
 Vector = tuple[float, float, float]
@@ -39,7 +39,7 @@ Wave = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class KneeScene:
-    """The shape of a knee, wholly told by these numbers. Lengths [m].
+    """The shape of a knee, fully determined by these numbers. Lengths [m].
 
     ``gap`` is the nearest distance between the condyle and the tissue below it; `None` for a closed joint.
     ``waves`` are the ripples of the surfaces, as `knee_field` reads them.
@@ -115,7 +115,7 @@ class KneeScene:
             for kind in (fields.RIDGE_HEIGHT, fields.RIDGE_DEPTH, MENISCUS)
         }
         highest = self.rim_height - amplitudes[fields.RIDGE_HEIGHT] - amplitudes[MENISCUS]
-        # The rim rises to the sides: bound it where the joint ends.
+        # The rim rises to the sides: its bound is at the end of the joint.
         highest -= 0.5 * self.rim_bend_y * self.capsule_radii[0] ** 2
         farthest = self.rim_depth + amplitudes[fields.RIDGE_DEPTH]
         return np.array(
@@ -168,11 +168,10 @@ class KneeScene:
         starts: Array | None = None,
         exact: bool = True,
     ) -> tuple[Array, Array, npt.NDArray[np.uint8], Array]:
-        """What rays from one origin (3,) along unit directions (n, 3) meet first, in the scene frame.
+        """First surface along rays from one origin (3,) in unit directions (n, 3), in the scene frame.
 
-        Returns points (n, 3), normals (n, 3) out of the tissue, surfaces (n,), 255 and NaN where nothing is
-        met, and the lengths (n,) of the rays. ``starts`` (n,) says how far along each ray is known to be
-        free.
+        Returns points (n, 3), normals (n, 3) out of the tissue, surfaces (n,), 255 and NaN if nothing is
+        hit, and the lengths (n,) of the rays. Each ray is known to be free up to ``starts`` (n,).
         """
         count = len(directions)
         lengths, normals = np.empty(count), np.empty((count, 3))
@@ -200,8 +199,8 @@ class KneeScene:
         return self.is_gap(points, surfaces)
 
     def is_gap(self, points: Array, surfaces: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-        """Whether what a ray met, points (n, 3) on surfaces (n,), was seen through the gap."""
-        # NaN compares as false: what met nothing is no gap.
+        """Whether points (n, 3) on surfaces (n,) were seen through the gap."""
+        # NaN compares as false: a ray that hits nothing is not in the gap.
         behind = points[:, 2] > self.rim_depth - 0.5 * self.rim_bend_z * points[:, 0] ** 2 + _BEHIND
         return np.asarray(behind & np.isin(surfaces, (PLATEAU, CAPSULE, MENISCUS)))
 

@@ -1,4 +1,4 @@
-"""How the tissues of the knee look."""
+"""Textures of the tissues of the knee."""
 
 from dataclasses import replace
 from functools import lru_cache

@@ -1,1 +1,1 @@
-"""A NatNet server of simulated bodies."""
+"""NatNet server of simulated rigid bodies."""

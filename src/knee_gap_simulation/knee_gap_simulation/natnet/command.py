@@ -1,6 +1,6 @@
-"""`natnet_server`: a NatNet server on the loopback, as Motive would be, with its faults.
+"""The command `natnet_server`: a NatNet server on the loopback that behaves like Motive, faults included.
 
-To test and show the tracking without a tracker.
+It is for tests and demonstrations of the tracking without a tracker.
 """
 
 import argparse
@@ -18,13 +18,13 @@ from knee_gap_simulation.natnet.server import HOST, NatNetServer, ServerSettings
 def _version(text: str) -> packets.Version:
     major, _, minor = text.partition(".")
     if not (major.isdecimal() and minor.isdecimal()):
-        raise argparse.ArgumentTypeError(f"'{text}' is no version such as 4.1")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a version such as 4.1")
     return int(major), int(minor)
 
 
 def _port(text: str) -> int:
     if not (text.isdecimal() and len(text) < 6 and 0 < int(text) < 65536):
-        raise argparse.ArgumentTypeError(f"'{text}' is no port, 1 to 65535")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a port, 1 to 65535")
     return int(text)
 
 
@@ -32,27 +32,33 @@ def _parser() -> Parser:
     parser = Parser(prog="natnet_server", description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("--version", type=_version, default=(4, 1), help="NatNet version: 3.0, 3.1, 4.0 or 4.1 (4.1)")
-    add("--claim-version", type=_version, help="tell clients this version instead of the one that is sent")
+    add("--claim-version", type=_version, help="version reported to clients, if not the one that is sent")
     add(
-        "--body", action="append", dest="bodies", help="name of a body, may be repeated (scope, tibia, clock)"
+        "--body", action="append", dest="bodies", help="name of a body; can be repeated (scope, tibia, clock)"
     )
-    add("--rate", type=positive, default=240.0, help="frames a second (240)")
+    add("--rate", type=positive, default=240.0, help="frames per second (240)")
     add("--command-port", type=_port, default=1510)
     add("--data-port", type=_port, default=1511, help="port of multicast data")
     add("--multicast", metavar="GROUP", help="send by multicast to this group, such as 239.255.42.99")
-    add("--latency-ms", type=not_negative, default=4.0, help="from exposure to sending (4)")
-    add("--jitter-ms", type=not_negative, default=0.0, help="mean of the random further delay (0)")
-    add("--drift-ppm", type=finite, default=40.0, help="how much too fast its clock runs (40)")
-    add("--lose", type=not_negative, default=0.0, metavar="SHARE", help="share of frames lost on the way (0)")
-    add("--invalid", type=not_negative, default=0.0, metavar="SHARE", help="share of poses not tracked (0)")
-    add("--occlude-every", type=not_negative, default=0.0, metavar="S", help="hide the first body that often")
+    add("--latency-ms", type=not_negative, default=4.0, help="time from exposure to sending (4)")
+    add("--jitter-ms", type=not_negative, default=0.0, help="mean of the additional random delay (0)")
+    add("--drift-ppm", type=finite, default=40.0, help="clock rate error, above 0 if fast (40)")
+    add("--lose", type=not_negative, default=0.0, metavar="SHARE", help="fraction of lost frames (0)")
+    add("--invalid", type=not_negative, default=0.0, metavar="SHARE", help="fraction of untracked poses (0)")
+    add(
+        "--occlude-every",
+        type=not_negative,
+        default=0.0,
+        metavar="S",
+        help="interval of occlusions of the first body",
+    )
     add("--occlude-for", type=not_negative, default=0.3, metavar="S")
     add(
         "--swap-every",
         type=not_negative,
         default=0.0,
         metavar="S",
-        help="swap the first two labels that often",
+        help="interval of swapping the first two labels",
     )
     add("--swap-for", type=not_negative, default=0.5, metavar="S")
     add(
@@ -60,7 +66,7 @@ def _parser() -> Parser:
         type=not_negative,
         default=0.0,
         metavar="S",
-        help="repeat the first body's pose, said to be valid",
+        help="interval of repeating the first body's pose, marked as valid",
     )
     add("--freeze-for", type=not_negative, default=0.5, metavar="S")
     add(
@@ -68,12 +74,12 @@ def _parser() -> Parser:
         type=not_negative,
         default=0.0,
         metavar="S",
-        help="take a reflection for the first body",
+        help="interval of reporting a reflection as the first body",
     )
     add("--jump-for", type=not_negative, default=0.5, metavar="S")
-    add("--restart-every", type=not_negative, default=0.0, metavar="S", help="go away that often")
+    add("--restart-every", type=not_negative, default=0.0, metavar="S", help="interval between restarts")
     add("--down-for", type=not_negative, default=3.0, metavar="S")
-    add("--duration", type=not_negative, default=0.0, metavar="S", help="end after that long (never)")
+    add("--duration", type=not_negative, default=0.0, metavar="S", help="end after this time (never)")
     add("--seed", type=int, default=0)
     return parser
 
@@ -87,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SimulationError as error:
         parser.error(str(error))
     except OSError as error:
-        print(f"natnet_server: its ports cannot be used: {error.strerror or error}", file=sys.stderr)
+        print(f"natnet_server: the ports cannot be used: {error.strerror or error}", file=sys.stderr)
         return 1
     stop = stop_on_signals()
     settings = server.settings

@@ -1,4 +1,4 @@
-"""NatNet packets to bytes, as Motive sends them: versions 3.0, 3.1, 4.0 and 4.1, little-endian.
+"""Encoding of NatNet packets as Motive sends them: versions 3.0, 3.1, 4.0 and 4.1, little-endian.
 
 A packet is a message number (uint16), the length of its payload (uint16) and the payload. Texts end with a
 zero byte; every list starts with its length (uint32), and from 4.1 on with its size in bytes too (uint32).
@@ -36,7 +36,7 @@ class BodyInFrame:
 
 @dataclass(frozen=True)
 class LabeledMarker:
-    """One marker that belongs to a model: its model and marker number stand in the id's halves."""
+    """One marker of a model; the halves of its id are the model's and the marker's number."""
 
     id: int
     position: Point
@@ -47,7 +47,7 @@ class LabeledMarker:
 
 @dataclass(frozen=True)
 class FrameContent:
-    """What one frame of data holds; ticks are of the server's clock. Assets (from 4.1 on) stay empty."""
+    """Content of one frame of data; ticks of the server's clock. Assets (from 4.1 on) stay empty."""
 
     number: int
     bodies: Sequence[BodyInFrame] = ()
@@ -79,7 +79,7 @@ class BodyModel:
 
 @dataclass(frozen=True)
 class Models:
-    """Definitions of everything in the stream; marker sets are their names and their markers' names."""
+    """Definitions of all models in the stream; marker sets are names and their markers' names."""
 
     bodies: Sequence[BodyModel] = ()
     marker_sets: Sequence[tuple[str, Sequence[str]]] = ()
@@ -88,7 +88,7 @@ class Models:
 
 
 def packet(message: int, payload: bytes) -> bytes:
-    """A payload with its header. Raises SimulationError where it is too long for one."""
+    """Packet of a payload and its header. Raises SimulationError if the payload is too long."""
     if len(payload) > 0xFFFF:
         raise SimulationError(f"a NatNet packet holds at most 65535 bytes, not {len(payload)}")
     return struct.pack("<HH", message, len(payload)) + payload
@@ -102,7 +102,7 @@ def server_info(
     multicast_address: str | None,
     motive: Version = (3, 1),
 ) -> bytes:
-    """What the server says of itself; `multicast_address` None means unicast."""
+    """Server description; `multicast_address` None means unicast."""
     group = (multicast_address or "239.255.42.99").split(".")
     return packet(
         SERVER_INFO,
@@ -114,7 +114,7 @@ def server_info(
 
 
 def echo_response(request_stamp: bytes, ticks: int) -> bytes:
-    """The client's stamp as it came and the server's ticks when it came."""
+    """Echo response: the client's stamp as received and the server's ticks at that time."""
     return packet(ECHO_RESPONSE, request_stamp + struct.pack("<Q", ticks))
 
 
@@ -138,7 +138,7 @@ def frame(version: Version, content: FrameContent) -> bytes:
     end = struct.pack("<IId", content.timecode, content.timecode_subframe, content.timestamp)
     end += struct.pack("<QQQ", content.mid_exposure_ticks, content.received_ticks, content.transmit_ticks)
     if version >= (4, 1):
-        end += struct.pack("<II", 0, 0)  # time of day by a hardware clock that is not there
+        end += struct.pack("<II", 0, 0)  # time of day by a hardware clock: there is none
     end += struct.pack("<HI", content.flags, 0)  # flags, end mark
     return packet(
         FRAME,
@@ -147,7 +147,7 @@ def frame(version: Version, content: FrameContent) -> bytes:
 
 
 def model_definitions(version: Version, models: Models) -> bytes:
-    """Names and shapes of what the frames hold."""
+    """Model definitions: names and shapes of the bodies in the frames."""
     sets = [(0, _text(name) + _list(map(_text, markers))) for name, markers in models.marker_sets]
     bodies = [(1, _body_model(version, body)) for body in models.bodies]
     plates = [(3, _force_plate(number, serial)) for number, serial in models.force_plates]

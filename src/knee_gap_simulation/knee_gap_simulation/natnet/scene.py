@@ -1,4 +1,4 @@
-"""What a simulated tracker sees: bodies on smooth paths, and the faults of a real room."""
+"""Rigid bodies of a simulated tracker: smooth paths, and the faults of a real room."""
 
 from dataclasses import dataclass, field
 
@@ -9,18 +9,18 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.natnet.packets import BodyInFrame, BodyModel
 
-# The clock body tells the time of exposure by its place, so that a client's stamps can be checked: x runs
-# from 0 to 1 m in this time [s], in single precision finer than a microsecond.
+# The position of the clock body encodes the time of exposure, so that a client's stamps can be checked: x
+# runs from 0 to 1 m in this time [s]. Single precision resolves it to better than a microsecond.
 CLOCK_SECONDS = 10.0
 CLOCK_NAME = "clock"
 PERIODIC = ("occlusion", "swap", "freeze", "jump")
-# How far a body is said to be away from where it is while it jumps [m]: further than a hand moves in a frame.
+# Error of a body's reported position during a jump [m]: more than a hand moves in a frame.
 JUMP = (0.06, 0.0, 0.02)
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong, each by its share of frames or by its period [s] and length [s]; 0 is never."""
+    """Faults, each by its fraction of frames or by its period [s] and length [s]; 0 is never."""
 
     lost_share: float = 0.0
     invalid_share: float = 0.0
@@ -44,10 +44,10 @@ class Faults:
 
 @dataclass
 class TrackedScene:
-    """Bodies with streaming ids from 1, swaying as in hands, each about its own place; Y up, as in Motive.
+    """Bodies with streaming ids from 1, swaying as in hands, each about its own position; Y up, as in Motive.
 
-    Faults with a period count from the first frame, which is sound. A body that is not seen keeps its last
-    pose with the valid bit cleared, as Motive does it.
+    Periods of faults count from the first frame, which has none. A body that is not tracked keeps its last
+    pose with the valid bit cleared, as in Motive.
     """
 
     names: tuple[str, ...]
@@ -57,7 +57,7 @@ class TrackedScene:
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) != len(self.names):
-            raise SimulationError(f"bodies need names that differ, not {', '.join(self.names) or 'none'}")
+            raise SimulationError(f"bodies must have different names, not {', '.join(self.names) or 'none'}")
         self._rng = np.random.default_rng(self.seed)
         self._last: dict[int, BodyInFrame] = {}
         self._start_s = float("nan")
@@ -68,11 +68,11 @@ class TrackedScene:
         return [BodyModel(number, name, corners) for number, name in enumerate(self.names, start=1)]
 
     def frame_is_lost(self) -> bool:
-        """Whether the next frame is lost on the way."""
+        """Whether the next frame is lost."""
         return bool(self._rng.random() < self.faults.lost_share)
 
     def bodies(self, time_s: float) -> list[BodyInFrame]:
-        """The bodies at a time of exposure [s], with the faults of that moment."""
+        """The bodies at a time of exposure [s], with the faults at that time."""
         if np.isnan(self._start_s):
             self._start_s = time_s
         seen = [self._body(number, time_s) for number in range(1, len(self.names) + 1)]
@@ -103,7 +103,7 @@ class TrackedScene:
         is_clock = self.names[number - 1] == CLOCK_NAME
         frozen = self._at_fault(number, time_s, self.faults.freeze_period, self.faults.freeze_length)
         if frozen and number in self._last:
-            # As a driver does that lost its connection: the valid bit still set.
+            # Like a driver that lost its connection: the valid bit is still set.
             return self._last[number]
         if not is_clock and self._hidden(number, time_s) and number in self._last:
             last = self._last[number]
@@ -124,7 +124,7 @@ class TrackedScene:
         return self._at_fault(number, time_s, faults.occlusion_period, faults.occlusion_length)
 
     def _at_fault(self, number: int, time_s: float, period: float, length: float) -> bool:
-        """Whether it is the time of a fault of the first body that comes with a period."""
+        """Whether a periodic fault of the first body is active."""
         return number == 1 and _within(time_s - self._start_s, period, length)
 
 
@@ -133,5 +133,5 @@ def _relabeled(body: BodyInFrame, number: int) -> BodyInFrame:
 
 
 def _within(time_s: float, period: float, length: float) -> bool:
-    """Whether a moment falls into the end of its period."""
+    """Whether a time falls into the last part of its period."""
     return period > 0.0 and time_s % period > period - length

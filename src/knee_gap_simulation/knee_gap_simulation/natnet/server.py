@@ -1,8 +1,8 @@
-"""A NatNet server on the loopback, as Motive would be, with its faults: to test and show without a tracker.
+"""A NatNet server on the loopback that behaves like Motive, faults included, for tests without a tracker.
 
-It answers connections, echoes and requests for model definitions, and sends frames by unicast to those who
-connected or by multicast. Its clock starts anywhere, runs at its own rate, and starts anew after each
-restart.
+It answers connections, echoes and requests for model definitions, and sends frames by unicast to connected
+clients or by multicast. Its clock starts at an arbitrary value, runs at its own rate, and starts again after
+each restart.
 """
 
 import heapq
@@ -27,9 +27,9 @@ CLIENT_SILENCE_NS = 10 * NANOSECONDS
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """How the server sends. Times in seconds, unless the name says otherwise.
+    """Settings of the server. Times in seconds, unless the name has another unit.
 
-    `claimed_version`: what it tells clients, where that is not the version that it sends.
+    `claimed_version` is the version reported to clients, if it is not the version that is sent.
     """
 
     version: packets.Version = (4, 1)
@@ -62,7 +62,7 @@ class ServerSettings:
 
 @dataclass
 class ServerCounts:
-    """What the server did."""
+    """Counts of the server's frames and restarts."""
 
     frames: int = 0
     restarts: int = 0
@@ -71,9 +71,9 @@ class ServerCounts:
 
 
 class NatNetServer:
-    """Serves a scene; `step` does what is due and waits for what comes next.
+    """Serves a scene. `step` handles what is due and waits for the next event.
 
-    Raises SimulationError where the port is taken.
+    Raises SimulationError if the port is in use.
     """
 
     def __init__(self, scene: TrackedScene, settings: ServerSettings | None = None) -> None:
@@ -95,7 +95,7 @@ class NatNetServer:
         self._command.close()
 
     def step(self, longest: float = 0.05) -> None:
-        """Answer what came, send what is due, and wait for the next of both for at most `longest` [s]."""
+        """Answer requests, send due frames, and wait for the next of either for at most `longest` [s]."""
         now = time.monotonic_ns()
         self._restart_if_due(now)
         if now >= self._next_ns and self._up(now):
@@ -141,21 +141,21 @@ class NatNetServer:
         return now >= self._down_until_ns
 
     def _expose(self, now: int) -> None:
-        """Make the frame whose exposure was due, and put it where it waits for its latency and jitter."""
+        """Make the frame whose exposure was due, and queue it for its latency and jitter."""
         settings = self.settings
         exposure_ns = self._next_ns
         self._next_ns += self._period_ns
         if now - self._next_ns > NANOSECONDS:
-            # The machine slept: what was missed then is not made up for.
+            # The machine slept: the frames missed meanwhile are not made up for.
             self._next_ns = now
         self._number += 1
-        # The scene runs by the time of day, so that another process can tell what is true.
+        # The scene runs by the time of day, so that another process can compute the truth.
         time_s = (exposure_ns + _time_of_day_offset_ns()) / NANOSECONDS
         bodies = self.scene.bodies(time_s)
         if self.scene.frame_is_lost():
             return
         delay = settings.latency + (self._rng.exponential(settings.jitter) if settings.jitter else 0.0)
-        # Motive's queue keeps the order: a frame that is late holds up those behind it.
+        # Motive's queue keeps the order: a late frame delays those behind it.
         send_ns = max(exposure_ns + round(delay * NANOSECONDS), self._last_send_ns)
         self._last_send_ns = send_ns
         content = packets.FrameContent(
@@ -187,7 +187,7 @@ class NatNetServer:
         try:
             data, sender = self._command.recvfrom(65536)
         except OSError:
-            return  # an answer to a client that is gone
+            return  # a reply to a client that has disconnected
         now = time.monotonic_ns()
         if not self._up(now) or len(data) < 4:
             return
@@ -225,7 +225,7 @@ class NatNetServer:
 
 
 def _bound_socket(port: int) -> socket.socket:
-    """Socket on the loopback, and on no other interface; what it sends by multicast stays there too."""
+    """Socket on the loopback interface only; its multicast stays there too."""
     result = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         result.bind((HOST, port))
@@ -240,7 +240,7 @@ def _bound_socket(port: int) -> socket.socket:
 
 
 def _time_of_day_offset_ns() -> int:
-    """Time of day minus monotonic time [ns], by the reading that was interrupted least."""
+    """Time of day minus monotonic time [ns], by the fastest of several readings."""
     readings = []
     for _ in range(3):
         before = time.monotonic_ns()

@@ -1,1 +1,1 @@
-"""Simulated bags: samples, metadata, ground truth."""
+"""Simulated bags: samples, metadata and ground truth."""

@@ -1,4 +1,4 @@
-"""The true mask of the gap in each image of a simulated bag, for whoever evaluates masks."""
+"""True gap masks of the images of a simulated bag, for the evaluation of segmentations."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ MaskAt = Callable[[int], npt.NDArray[np.bool_] | None]
 
 
 def gap_masks(bag: Path) -> MaskAt | None:
-    """Mask of the gap at a stamp [ns], None where the bag has no true lens pose; None for other bags."""
+    """Return the true gap mask by stamp [ns], None without a true lens pose; None for other bags."""
     poses: dict[int, Array] = {}
     try:
         with BagReader(bag) as reader:

@@ -1,4 +1,4 @@
-"""A simulated recording as a bag: pictures, camera, tracked and true poses, the scene in the metadata."""
+"""A simulated recording as a bag: images, camera, tracked and true poses, with the scene in the metadata."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ LENS_POSE_TRUE = "/knee_gap/scope_pose_true"
 OPTICAL_FRAME = "arthroscope_optical"
 PARAMETERS_FILE = "scope.yaml"
 
-# From exposure, or from the tracker's shutter, to the recorder.
+# Latency from the exposure of an image, or of the tracker, to the recorder.
 IMAGE_LATENCY_NS = 8_000_000
 POSE_LATENCY_NS = 3_000_000
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One instant of a recording: an image or a pose, by whichever of its fields is set."""
+    """One sample of a recording: an image or a pose, whichever field is set."""
 
     stamp_ns: int
     jpeg: bytes | None = None
@@ -44,16 +44,16 @@ class Sample:
 
     @property
     def record_ns(self) -> int:
-        """When a recorder would have received it."""
+        """Time at which a recorder would have received it."""
         return self.stamp_ns + (POSE_LATENCY_NS if self.jpeg is None else IMAGE_LATENCY_NS)
 
 
 def pose_samples(
     times: Array, T_world_body: Array, T_world_lens: Array, T_body_lens: Array
 ) -> Iterator[Sample]:
-    """The tracker's samples at times (n,) [s]: reported bodies (n, 4, 4), those of true lenses (n, 4, 4).
+    """The tracker's samples at times (n,) [s]: reported body poses (n, 4, 4) of true lens poses (n, 4, 4).
 
-    The lens on the body is (4, 4), or (n, 4, 4) where the scope is turned in its camera head.
+    The lens on the body is (4, 4), or (n, 4, 4) if the scope rotates in its camera head.
     """
     true = T_world_lens @ inverse(T_body_lens)
     for time, body, body_true in zip(times, T_world_body, true, strict=True):
@@ -64,7 +64,7 @@ def write_recording(path: Path, samples: Iterable[Sample], lens: Lens, metadata:
     """Write a new bag of samples, in the order of their ``record_ns``; camera_info is the calibrated lens.
 
     The true lens pose is written at the stamp of every image, the body's poses at the tracker's own stamps.
-    Raises BagError where the bag cannot be written.
+    Raises BagError if the bag cannot be written.
     """
     camera_info = camera_info_message(calibrated(lens))
     with BagWriter(path, metadata=metadata) as bag:
@@ -115,7 +115,7 @@ def pose_message(T_world_x: Array, stamp_ns: int) -> Any:
 
 
 def write_parameters(path: Path, scope: Scope, media: Media) -> None:
-    """Write the scope, and what it was calibrated and is used in, as a ROS parameter file for the nodes."""
+    """Write the scope and its media of calibration and use as a ROS parameter file for the nodes."""
     camera = {"camera_info_medium": media.calibrated_in, "medium": media.used_in}
     parameters = {
         "/**/segmentation_node": {"ros__parameters": camera},

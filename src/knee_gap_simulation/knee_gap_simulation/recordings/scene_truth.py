@@ -1,4 +1,4 @@
-"""The truth of a simulated recording: which surface point lies behind any pixel."""
+"""Ground truth of a simulated recording: surface points behind pixels, edges and instrument gaps."""
 
 import json
 from collections.abc import Mapping
@@ -31,15 +31,15 @@ from knee_gap_simulation.surfaces.instrument_gap import CONE, InstrumentGap
 
 METADATA_KEY = "knee_gap_simulation"
 
-# Where between two points of the sides the opening is looked for.
+# Fractions of the way between two points of the sides at which the opening is searched.
 _ALONG_SECTION = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """A scene, where it lies in the world, the scope that looked at it, and the probe that came and went.
+    """A scene, its pose in the world, the scope that recorded it, and the probe.
 
-    `lens` is as it is in use; `media` are what it was calibrated in and is used in.
+    `lens` is the lens in use; `media` are those of its calibration and use.
     """
 
     scene: RimScene | KneeScene
@@ -54,8 +54,8 @@ class SceneTruth:
     ) -> Array:
         """Points (n, 3) in the world [m] behind pixels (n, 2) [px] of an image with a true lens pose (4, 4).
 
-        NaN where the ray meets nothing and outside the field of view. With the stamp of the image a pixel
-        that shows the probe gives the probe's point, without it the tissue behind.
+        NaN if the ray hits nothing or the pixel is outside the field of view. With the stamp of the image, a
+        pixel that shows the probe gives the probe's point; without it, the tissue behind.
         """
         bearings = self.lens.bearings(np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
         T_scene_lens = self._lens_in_scene(T_world_lens)
@@ -82,9 +82,9 @@ class SceneTruth:
     ) -> InstrumentGap:
         """The instrument gap of the section between two edges (2, 3), unit vectors in the lens frame.
 
-        Seen from a true lens pose (4, 4); the axis is in the world [m]. ``cone`` is the half angle [rad] of
-        the directions about that of view, 0 for the view only. Raises SimulationError for edges that are
-        not finite or bound no gap.
+        The lens pose (4, 4) is the true one; the axis is in the world [m]. ``cone`` is the half angle [rad]
+        of the axis directions about the direction of view; 0 allows that direction only. Raises
+        SimulationError for edges that are not finite or do not bound a gap.
         """
         found = true_instrument_gap(self.scene, self._lens_in_scene(T_world_lens), edge_bearings, cone=cone)
         return found.moved(self.T_world_scene)
@@ -94,9 +94,9 @@ class SceneTruth:
     ) -> float:
         """The instrument gap [m] at the section that an image's edges (2, 3) report.
 
-        Where they are NaN it is the section through the middle between two points of the sides, at pixels
-        (2, 2) [px] of the image. NaN where there is no opening between those either, and for edges that
-        bound no gap.
+        If they are NaN, it is the section through the middle between two points of the sides, at pixels
+        (2, 2) [px] of the image. NaN if there is no opening between those either, and for edges that do not
+        bound a gap.
         """
         bearings = np.asarray(edge_bearings, dtype=np.float64).reshape(2, 3)
         ends = np.asarray(pixels, dtype=np.float64).reshape(2, 2)
@@ -114,7 +114,7 @@ class SceneTruth:
             return float("nan")
 
     def section(self, T_world_lens: npt.ArrayLike, edge_bearings: npt.ArrayLike) -> SectionTruth:
-        """All that is true of the section between two edges (2, 3), seen from a true lens pose."""
+        """Ground truth of the section between two edges (2, 3), seen from a true lens pose."""
         found = section_truth(self.scene, self._lens_in_scene(T_world_lens), edge_bearings)
         return found.moved(self.T_world_scene)
 
@@ -126,15 +126,15 @@ class SceneTruth:
     ) -> Array:
         """True bearings (2, 3) of the edges on the line across the opening through a pixel (2,) in it [px].
 
-        ``across_direction`` (2,) in the image; without it that in which the opening is narrowest. NaN if the
-        pixel does not look into the gap, or the line leaves the field of view before it meets an edge.
+        ``across_direction`` (2,) is in the image; by default, the direction of the narrowest opening. NaN if
+        the pixel is not in the gap, or if the line leaves the field of view before it meets an edge.
         """
         return edges_at_section(
             self.scene, self.lens, self._lens_in_scene(T_world_lens), pixel, across_direction
         )
 
     def as_metadata(self, **more: Any) -> dict[str, str]:
-        """Metadata of a bag from which `scene_from_metadata` makes this truth again."""
+        """Metadata of a bag from which `scene_from_metadata` restores this ground truth."""
         values = {
             "format": 1,
             "scene": self.scene.as_dict(),
@@ -158,7 +158,7 @@ class SceneTruth:
 
 
 def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
-    """The truth that a bag's metadata tell. Raises SimulationError where there is none."""
+    """Ground truth from a bag's metadata. Raises SimulationError if there is none."""
     try:
         values = json_value(metadata[METADATA_KEY])
         kind = values["scene"]["kind"]

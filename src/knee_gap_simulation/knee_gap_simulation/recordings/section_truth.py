@@ -1,4 +1,4 @@
-"""The truth of one section of an opening: its edges, what an instrument meets there, and other widths."""
+"""Ground truth of one section of an opening: its edges, its instrument gap, and other widths."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from knee_gap_simulation.surfaces.tissue_samples import LOWER_SIDE, UPPER_SIDE, 
 
 Scene = RimScene | KneeScene
 
-# How far from the plane of the section [m] tissue counts for the nearest distance of the two sides there.
+# Distance from the plane of the section within which tissue counts for the nearest distance of the sides [m].
 NEAR_SECTION = 0.5e-3
 
 # Edges [rad] that are nearer to each other bound nothing; lines of sight farther off all tissue are no edges.
@@ -31,12 +31,12 @@ _STEP_PX = 3.0
 
 
 class SectionTruth(NamedTuple):
-    """What is true of one section. Lengths [m], points and directions in the frame of the lens pose given.
+    """Ground truth of one section. Lengths [m], points and directions in the frame of the given lens pose.
 
-    edge_points (2, 3): what the edges' lines of sight touch. instrument: the instrument gap. along_view: the
-    same for an axis that may not leave the direction of view. edge_distance: between the edge points.
-    across_view: that distance as it is across the view, (r0 + r1) sin(half the angle between the edges) with
-    the ranges r. nearest_distance: the least between the two sides within ``NEAR_SECTION`` of the section.
+    edge_points (2, 3): the points that the edges' viewing rays touch. instrument: the instrument gap.
+    along_view: the same with the axis along the direction of view. edge_distance: between the edge points.
+    across_view: that distance across the view, (r0 + r1) sin(half the angle between the edges) with the
+    ranges r. nearest_distance: the least between the two sides within ``NEAR_SECTION`` of the section.
     """
 
     edge_points: Array
@@ -97,7 +97,7 @@ def true_instrument_gap(
 
 
 def section_truth(scene: Scene, T_scene_lens: Array, edge_bearings: npt.ArrayLike) -> SectionTruth:
-    """All that is true of the section between two edges (2, 3), bearings of a lens; in the scene."""
+    """Ground truth of the section between two edges (2, 3), bearings of a lens; in the scene."""
     edges = edge_contacts(scene, T_scene_lens, edge_bearings)
     view, lens = view_between(T_scene_lens, edge_bearings), T_scene_lens[:3, 3]
     tissue = _tissue(scene, edges)
@@ -122,9 +122,9 @@ def edges_at_section(
 ) -> Array:
     """True bearings (2, 3) of the edges on the line across the opening through a pixel (2,) [px] in it.
 
-    ``across_direction`` (2,) in the image, without it that in which the opening is narrowest. The first edge
-    is that on the side from which the direction comes; for the narrowest one, the one further up in the
-    scene. NaN if the pixel does not look into the gap, or the line leaves the field of view before an edge.
+    ``across_direction`` (2,) is in the image; by default, the direction of the narrowest opening. The first
+    edge is the one from which the direction points away; by default, the upper one in the scene. NaN if the
+    pixel is not in the gap, or if the line leaves the field of view before it meets an edge.
     """
     at = np.asarray(pixel, dtype=np.float64).reshape(2)
     unknown = np.full((2, 3), np.nan)
@@ -135,7 +135,7 @@ def edges_at_section(
         lengths = _spokes(scene, lens, T_scene_lens, at, angles)
         half = _DIRECTIONS // 2
         best = float(angles[int(np.argmin(lengths[:half] + lengths[half:]))])
-        # The narrowest direction to a hundredth of the step of the fan.
+        # Refine the narrowest direction to a hundredth of the fan's step.
         for step in (0.5, 0.1, 0.02):
             fan = best + np.arange(-4, 5) * step * 0.5 * np.pi / half
             lengths = _spokes(scene, lens, T_scene_lens, at, np.concatenate([fan, fan + np.pi]))
@@ -156,12 +156,12 @@ def edges_at_section(
 
 
 def _spokes(scene: Scene, lens: Lens, T_scene_lens: Array, at: Array, angles: Array) -> Array:
-    """How far (n,) [px] the gap is open from a pixel in directions (n,) [rad]; infinite to the field stop."""
+    """Distance (n,) [px] from a pixel to the edge in directions (n,) [rad]; infinite if there is none."""
     units = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     radii = np.arange(_STEP_PX, 2.0 * lens.radius_px, _STEP_PX)
     far = np.full(len(angles), np.inf)
     for k in range(len(angles)):
-        # In pieces: most spokes are short.
+        # Piece by piece, since most spokes are short.
         for piece in np.split(radii, range(40, len(radii), 40)):
             pixels = at + piece[:, None] * units[k]
             seen = np.isfinite(lens.bearings(pixels)[:, 0])
@@ -180,7 +180,7 @@ def _spokes(scene: Scene, lens: Lens, T_scene_lens: Array, at: Array, angles: Ar
 
 
 def _open(scene: Scene, lens: Lens, T_scene_lens: Array, pixels: Array) -> npt.NDArray[np.bool_]:
-    """Whether pixels (n, 2) look into the gap, past probe and debris; not outside the field of view."""
+    """Whether pixels (n, 2) look into the gap, ignoring probe and debris; false outside the field of view."""
     bearings = lens.bearings(pixels)
     seen = np.isfinite(bearings[:, 0])
     result = np.zeros(len(pixels), bool)
@@ -190,13 +190,15 @@ def _open(scene: Scene, lens: Lens, T_scene_lens: Array, pixels: Array) -> npt.N
 
 
 def _place(edges: Array) -> tuple[int, int, int, float]:
-    """The cell of a section, and how far around its middle the tissue matters."""
+    """Grid cell of a section, and the radius around its middle in which tissue matters."""
     width = float(np.linalg.norm(edges[1] - edges[0]))
     for widest, reach in _REACHES:
         if width <= widest:
             x, y, z = np.round(edges.mean(axis=0) / _GRID)
             return int(x), int(y), int(z), reach
-    raise SimulationError(f"edges {1e3 * width:.1f} mm apart bound no gap, the widest is {1e3 * widest:g} mm")
+    raise SimulationError(
+        f"edges {1e3 * width:.1f} mm apart do not bound a gap: more than {1e3 * widest:g} mm"
+    )
 
 
 def _tissue(scene: Scene, edges: Array) -> TissuePoints:

@@ -1,1 +1,1 @@
-"""Two surfaces with sharp rims: the simple scene."""
+"""The simple scene: two surfaces with sharp rims."""

@@ -1,4 +1,4 @@
-"""Pictures of a scene: rays through every pixel of the field of view, light, and the camera head behind."""
+"""Renderer of a scene: rays through every pixel of the field of view, light, and the camera head."""
 
 from typing import Any, Protocol
 
@@ -14,14 +14,14 @@ from knee_gap_simulation.surfaces.textures import FloatImage
 
 
 class Scene(Protocol):
-    """What can be looked at. Everything is in the scene's own frame, lengths in metres."""
+    """Interface of a scene. All values are in the scene's own frame, lengths in metres."""
 
     def textures(self) -> FloatImage:
         """Textures (k, size, size, channels) of its surfaces."""
         ...
 
     def cast(self, origin: Array, directions: Array) -> tuple[Array, Array, Array, npt.NDArray[np.uint8]]:
-        """Points (n, 3), normals (n, 3), uv (n, 2) and surfaces (n,) that rays (n, 3) from (3,) meet."""
+        """Points (n, 3), normals (n, 3), uv (n, 2) and surfaces (n,) that rays (n, 3) from (3,) hit."""
         ...
 
     def as_dict(self) -> dict[str, Any]:
@@ -30,7 +30,7 @@ class Scene(Protocol):
 
 
 class ScopeCamera:
-    """Renders frames of a scene in order; the automatic exposure follows from frame to frame."""
+    """Renders frames of a scene in order, with automatic exposure from frame to frame."""
 
     def __init__(
         self,
@@ -47,13 +47,12 @@ class ScopeCamera:
         self._textures = scene.textures()
         stop = self.lens.field_stop()
         rows, columns = np.nonzero(stop)
-        # Only the box around the picture is worked on; the rest stays black.
+        # Only the box around the field of view is rendered; the rest stays black.
         self._box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
         self._stop = np.ascontiguousarray(stop[self._box])
         self._inside = self._stop > 0.0
         self._notch = Notch(self.lens, self._box)
-        # Rays of the soft border go a hair's breadth beyond the field of view: take the bearing of the rim
-        # there.
+        # Rays of the soft border lie just beyond the field of view: use the bearing of the rim there.
         pixels = self.lens.pixel_grid()[self._box][self._inside]
         centre = np.array([self.lens.centre_x_px, self.lens.centre_y_px])
         offset = pixels - centre

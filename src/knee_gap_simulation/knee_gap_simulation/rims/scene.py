@@ -1,4 +1,4 @@
-"""Two wet leaves of tissue with sharp rims and a dark gap between them: the simple scene.
+"""The simple scene: two wet leaves of tissue with sharp rims and a dark gap between them.
 
 Scene frame: x along the gap, y across it, z away from the lens; the origin is the middle of the gap on the
 plane of the rims. Each leaf is a height field z = f(x, y) that ends at a wavy rim and hides its own
@@ -30,7 +30,7 @@ from knee_gap_simulation.surfaces.tissue_samples import (
 
 KIND = "rims"
 UPPER, LOWER, WALL = 0, 1, 2
-# How far from the middle of the gap [m] an edge of it is looked for.
+# Distance from the middle of the gap within which its edges are searched [m].
 _EDGE_WITHIN = 0.018
 
 _TISSUES = (
@@ -42,7 +42,7 @@ _TISSUES = (
 
 @dataclass(frozen=True)
 class RimScene:
-    """The scene, wholly told by these numbers. Lengths [m].
+    """The scene, fully determined by these numbers. Lengths [m].
 
     ``gap`` is the nominal distance of the rims at x = 0, their widest place; away from it the gap narrows
     to ``end_share`` of it over ``opening``. Each wave is (side, amplitude, wave number u, v, phase): side 0
@@ -99,10 +99,10 @@ class RimScene:
         return np.stack([tissue_texture(tissue, rng) for tissue in _TISSUES])
 
     def cast(self, origin: Array, directions: Array) -> tuple[Array, Array, Array, Any]:
-        """What rays from one origin (3,) along unit directions (n, 3) meet first, all in the scene frame.
+        """First surface along rays from one origin (3,) in unit directions (n, 3), all in the scene frame.
 
         Returns points (n, 3), normals (n, 3) towards the lens, uv (n, 2) [m] and surfaces (n,); points are
-        NaN and surfaces NOTHING where nothing is met or the direction is NaN.
+        NaN and surfaces NOTHING if nothing is hit or the direction is NaN.
         """
         count = len(directions)
         points, normals = np.empty((count, 3)), np.empty((count, 3))
@@ -170,7 +170,7 @@ class RimScene:
 
 @compiled
 def _rim(x: float, side: int, constants: Array, waves: Array) -> float:
-    """Where a leaf ends: its y at a place x along the gap."""
+    """Rim of a leaf: its y at a position x along the gap."""
     gap, end_share, opening = constants[0], constants[1], constants[2]
     half = 0.5 * gap * (end_share + (1.0 - end_share) * np.exp(-((x / opening) ** 2)))
     y = -half if side == 0 else half

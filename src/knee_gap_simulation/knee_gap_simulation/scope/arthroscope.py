@@ -1,4 +1,4 @@
-"""The rigid scope: where its lens sits on the body that the tracker sees."""
+"""The simulated rigid scope: pose of its lens on the tracked body."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class Scope:
     """A 30 degree arthroscope with a marker cluster behind its handle.
 
     ``shaft_origin`` [m] and ``shaft_turn`` (rotation vector [rad]) place the shaft frame on the body:
-    origin at the lens, z along the shaft to the tip, x right and y down in the picture of a straight scope.
-    The body's axes are those the markers happened to have, so they fit the shaft only roughly.
-    ``oblique_angle`` [rad] tips the view to the top of the picture.
+    origin at the lens, z along the shaft to the tip, x right and y down in the image of a straight scope.
+    The body's axes depend on the markers, so they agree with the shaft only roughly. ``oblique_angle`` [rad]
+    tilts the view to the top of the image.
     """
 
     shaft_origin: tuple[float, float, float] = (0.0035, -0.0120, 0.2000)

@@ -1,4 +1,4 @@
-"""When images are exposed and when the tracker looks."""
+"""Exposure times of the images and of the tracker, and stamps."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from knee_gap_core.values.arrays import Array
 EPOCH_NS = 1_700_000_000_000_000_000
 TRACKER_HZ = 120.0
 POSE_MARGIN_S = 0.05
-# The tracker's clock is not the camera's: its samples fall between the images.
+# The tracker is not synchronised with the camera: its samples fall between the images.
 TRACKER_PHASE_S = 0.0017
 
 

@@ -1,4 +1,4 @@
-"""How a hand moves the scope: smooth travel, physiological tremor, slow drift and small turns."""
+"""Motion of the scope in a hand: smooth travel, physiological tremor, slow drift and small rotations."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +12,7 @@ from knee_gap_simulation.errors import SimulationError
 
 
 class TravelDirection(StrEnum):
-    """Where the scope travels, seen from the gap: along it, across it, or towards it."""
+    """Direction of the scope's travel relative to the gap: along it, across it, or towards it."""
 
     ALONG = "along"
     ACROSS = "across"
@@ -32,7 +32,7 @@ def minimum_jerk(phase: npt.ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Hand:
-    """Size of a hand's movements. Lengths [m] and angles [rad] are RMS lengths of the vectors."""
+    """Amplitudes of a hand's movements. Lengths [m] and angles [rad] are RMS lengths of the vectors."""
 
     still_s: float = 0.3
     reach_s: float = 2.5
@@ -41,15 +41,14 @@ class Hand:
     tremor_turn: float = np.radians(0.03)
     drift: float = 0.12e-3
     drift_turn: float = np.radians(0.5)
-    pivot_turn: float = np.radians(2.5)  # turn of the scope about the portal over the whole travel
+    pivot_turn: float = np.radians(2.5)  # rotation of the scope about the portal over the whole travel
 
 
 class HandMotion:
     """Lens poses over time: ``T_scene_lens`` as a smooth function, exact at any time.
 
-    The lens looks along the scene's z from ``depth`` in front of the gap, its picture turned by ``roll``.
-    After a still start it reaches over ``travel`` and back, again and again. The same seed gives the same
-    motion.
+    The lens looks along the scene's z from ``depth`` in front of the gap, with its image rotated by ``roll``.
+    It starts at rest, then moves over ``travel`` and back repeatedly. The same seed gives the same motion.
     """
 
     def __init__(
@@ -66,10 +65,10 @@ class HandMotion:
         portal: float | None = None,
         shaft: tuple[float, float, float] = (0.0, 0.0, 1.0),
     ) -> None:
-        """Lengths [m]. `portal`: how far behind the tip the shaft passes through the skin; it turns about it.
+        """Lengths [m]. `portal` is the distance from the tip back to the skin, where the shaft pivots.
 
-        The `shaft` points to the tip, in the frame of the lens. Without a portal the hand turns the view back
-        to the gap by `Hand.pivot_turn`.
+        The `shaft` points to the tip, in the frame of the lens. Without a portal, the hand rotates the view
+        back to the gap by `Hand.pivot_turn`.
         """
         if not 0.0 <= travel <= 0.05:
             raise SimulationError(f"travel must lie in [0, 0.05] m, not {travel}")
@@ -92,7 +91,7 @@ class HandMotion:
         self._drift_turn = _Wander(rng, self._hand.drift_turn, (0.05, 0.35), waves=3)
 
     def travelled(self, time_s: npt.ArrayLike) -> Array:
-        """Share of the travel, in [0, 1], that the reach alone has covered at times [s]."""
+        """Fraction of the travel, in [0, 1], covered by the reach alone at times [s]."""
         hand = self._hand
         stroke = hand.reach_s + hand.rest_s
         since = np.maximum(np.asarray(time_s, dtype=np.float64) - hand.still_s, 0.0)
@@ -120,12 +119,12 @@ class HandMotion:
         return rigid(rotation, position)
 
     def _about_portal(self, reached: Array) -> Array:
-        """Rotations (..., 3, 3) of a shaft that passes through the portal, for shares (...) of the travel."""
+        """Rotations (..., 3, 3) of a shaft through the portal, for fractions (...) of the travel."""
         assert self._arm is not None
         before = self._arm / np.linalg.norm(self._arm)
         after = self._arm + self._travel * reached[..., None] * np.eye(3)[self._axis]
         after = after / np.linalg.norm(after, axis=-1, keepdims=True)
-        # The shortest turn from one direction to the other: a hand that does not twist the shaft.
+        # The shortest rotation from one direction to the other: the hand does not twist the shaft.
         across = np.cross(before, after)
         sine = np.linalg.norm(across, axis=-1, keepdims=True)
         angle = np.arctan2(sine, (after @ before)[..., None])
@@ -134,7 +133,7 @@ class HandMotion:
 
 
 class _Wander:
-    """A smooth vector process: a few sine waves an axis, zero at time 0."""
+    """A smooth vector process: a few sine waves per axis, zero at time 0."""
 
     def __init__(
         self, rng: np.random.Generator, rms: float, band_hz: tuple[float, float], waves: int

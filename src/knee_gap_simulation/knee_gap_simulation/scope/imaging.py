@@ -1,4 +1,4 @@
-"""From light to picture: exposure, the lens's softness, sensor noise, tone curve, JPEG."""
+"""Image formation from light: exposure, blur of the lens, sensor noise, tone curve, JPEG."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ ByteImage = npt.NDArray[np.uint8]
 class Sensor:
     """The camera head.
 
-    ``target`` is the mean display brightness that the automatic exposure aims at, ``settle_s`` how slowly
-    it follows; ``blur_px`` the softness of the lens; ``shot_noise`` and ``read_noise`` are RMS values at
-    full scale, in linear light (full scale 1).
+    ``target`` is the mean display brightness that the automatic exposure aims at, ``settle_s`` its time
+    constant; ``blur_px`` is the blur of the lens; ``shot_noise`` and ``read_noise`` are RMS values at full
+    scale, in linear light (full scale 1).
     """
 
     target: float = 0.40
@@ -43,7 +43,7 @@ class AutoExposure:
         """Gain for a linear image (h, w, 3), metered with weights (h, w), ``step_s`` after the last one."""
         luminance = radiance[::8, ::8] @ np.array([0.1, 0.6, 0.3], np.float32)
         metered = weight[::8, ::8]
-        # The display curve is close to a square root: meter there, so that glare does not darken the picture.
+        # Metering uses the square root, close to the display curve, so that glare does not darken the image.
         level = float((np.sqrt(luminance) * metered).sum() / metered.sum())
         wanted = 2.0 * np.log(self._sensor.target / max(level, 1e-4))
         if self._log_gain is None:

@@ -1,6 +1,6 @@
 """The simulated lens: an ideal equidistant fisheye behind a circular field stop.
 
-Written apart from the camera models of the perception, so that a mistake there cannot hide in the truth.
+It is independent of the perception's camera models, so that a mistake in those shows against the truth.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Lens:
     """An equidistant lens: a bearing at the angle a from the axis falls focal_px * a from the centre.
 
     Frame: optical (z along the view, x right, y down). Pixel (0, 0) is the centre of the first pixel.
-    ``field_of_view`` is the full angle [rad] that the field stop lets through; the image is black beyond it.
+    ``field_of_view`` is the full angle [rad] that passes the field stop; the image is black beyond it.
     """
 
     width_px: int = 1280
@@ -46,7 +46,7 @@ class Lens:
         """Unit vectors (..., 3) of pixels (..., 2) [px]; NaN outside the field of view."""
         offset = np.asarray(pixels, dtype=np.float64) - (self.centre_x_px, self.centre_y_px)
         angle = np.hypot(offset[..., 0], offset[..., 1]) / self.focal_px
-        # sin(a) / r, written so that the centre needs no special case.
+        # sin(a) / r in a form that needs no special case at the centre.
         scale = np.sinc(angle / np.pi) / self.focal_px
         unit = np.stack([offset[..., 0] * scale, offset[..., 1] * scale, np.cos(angle)], axis=-1)
         unit[~(angle <= self.field_of_view / 2.0)] = np.nan
@@ -71,7 +71,7 @@ class Lens:
         return np.stack([x_px, y_px], axis=-1)
 
     def field_stop(self, softness_px: float = 1.5) -> npt.NDArray[np.float32]:
-        """Share (height, width) of the light that passes the stop: 1 inside, 0 outside, soft between."""
+        """Fraction (height, width) of the light that passes the stop: 1 inside, 0 outside, soft between."""
         offset = self.pixel_grid() - (self.centre_x_px, self.centre_y_px)
         inside = (self.radius_px - np.hypot(offset[..., 0], offset[..., 1])) / softness_px
         return np.clip(inside, 0.0, 1.0).astype(np.float32)

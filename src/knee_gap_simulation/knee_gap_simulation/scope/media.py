@@ -1,6 +1,6 @@
-"""Air, saline and water before the lens: what a lens that was calibrated in one shows in another.
+"""Media in front of the lens: a lens that is calibrated in one and used in another (air, saline, water).
 
-Written apart from the perception, as `lens` is, so that a mistake there cannot hide in the truth.
+It is independent of the perception, as `lens` is, so that a mistake there shows against the ground truth.
 """
 
 from dataclasses import dataclass, field
@@ -18,14 +18,14 @@ INDICES = {"air": 1.0, "saline": 1.336, "water": 1.333}
 
 
 class Media(NamedTuple):
-    """What a lens was calibrated in, and what it is used in: names of INDICES, or refractive indices."""
+    """Media in which a lens was calibrated and is used: names of INDICES, or refractive indices."""
 
     calibrated_in: Medium
     used_in: Medium
 
     @property
     def ratio(self) -> float:
-        """Sine of an angle in use to that at the calibration."""
+        """Ratio of the sine of an angle in use to that at the calibration."""
         return index_of(self.calibrated_in) / index_of(self.used_in)
 
 
@@ -33,7 +33,7 @@ IN_SALINE = Media("saline", "saline")
 
 
 def index_of(medium: Medium) -> float:
-    """Refractive index of a medium. Raises SimulationError for one that there is not."""
+    """Refractive index of a medium. Raises SimulationError for an unknown medium."""
     if isinstance(medium, str) and medium in INDICES:
         return INDICES[medium]
     try:
@@ -50,7 +50,7 @@ def index_of(medium: Medium) -> float:
 class RefractedLens(Lens):
     """A lens behind a flat window across its axis: sin(angle) = ratio * sin(angle of `inner`) (Snell).
 
-    Its picture is as large as that of `inner`, and shows a smaller field where the ratio is below 1.
+    Its image is as large as that of `inner`, and shows a smaller field if the ratio is below 1.
     """
 
     inner: Lens = field(default_factory=Lens)
@@ -58,12 +58,12 @@ class RefractedLens(Lens):
 
     @staticmethod
     def of(inner: Lens, ratio: float) -> Lens:
-        """`inner` where sines of angles are `ratio` times as large: itself for 1."""
+        """`inner` with the sines of all angles multiplied by `ratio`; itself for 1."""
         if ratio == 1.0:
             return inner
         side = ratio * np.sin(inner.field_of_view / 2.0)
         if side >= 1.0:
-            raise SimulationError("the window reflects the border of the field: choose another medium")
+            raise SimulationError("total reflection at the border of the field: choose another medium")
         return RefractedLens(
             width_px=inner.width_px,
             height_px=inner.height_px,
@@ -90,7 +90,7 @@ class RefractedLens(Lens):
 
 
 def calibrated(lens: Lens) -> Lens:
-    """The lens as its calibration has it."""
+    """The lens in the medium of its calibration."""
     return lens.inner if isinstance(lens, RefractedLens) else lens
 
 

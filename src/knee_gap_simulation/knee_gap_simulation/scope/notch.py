@@ -1,4 +1,4 @@
-"""The notch of the field stop: a black triangle at the border of the picture that points inwards."""
+"""The notch of the field stop: a black triangle at the border of the image that points inwards."""
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,7 @@ DEPTH = 0.055  # of the field's radius
 
 
 class Notch:
-    """The share of light that passes it, in a box (rows, columns) of the picture of a lens."""
+    """Fraction of the light that passes the notch, in a box (rows, columns) of the image of a lens."""
 
     def __init__(self, lens: Lens, box: tuple[slice, slice]) -> None:
         offset = (lens.pixel_grid()[box] - (lens.centre_x_px, lens.centre_y_px)).astype(np.float32)
@@ -19,7 +19,7 @@ class Notch:
         self._angle = np.arctan2(offset[..., 1], offset[..., 0])
 
     def light(self, angle: float) -> npt.NDArray[np.float32]:
-        """Share (h, w) with the notch at an angle [rad] in the picture, from x towards y."""
+        """Fraction (h, w) with the notch at an angle [rad] in the image, from x towards y."""
         away = (self._angle - angle + np.pi) % (2 * np.pi) - np.pi
         height = DEPTH * (1 - np.abs(away) / HALF_WIDTH)
         inside = (1 - height - self._radius) * self._radius_px

@@ -1,4 +1,4 @@
-"""A lens without distortion, as `Lens` is one that is equidistant: for calibrations by the pinhole model."""
+"""A lens without distortion, for calibrations by the pinhole model."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The optical tracker: what it reports of the scope, at 120 Hz and with its error."""
+"""The simulated optical tracker: reported poses of the scope, at 120 Hz and with errors."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ class TrackerNoise:
     """Errors of the tracked lens pose: RMS lengths of the error vectors (Table 3 of the paper).
 
     ``translation_error`` [m] and ``rotation_error`` [rad] are Gaussian on each axis, independent between
-    samples, with a variance of RMS^2 / 3 an axis.
+    samples, with a variance of RMS^2 / 3 per axis.
     """
 
     translation_error: float = 0.0367e-3
@@ -31,10 +31,10 @@ def tracked_body(
 ) -> Array:
     """Body poses ``T_world_body`` (n, 4, 4) as the tracker reports them for true lens poses (n, 4, 4).
 
-    The paper states its error at the point that is used, the lens. An independent rotation error of 0.004
-    degrees on a lever of 0.2 m would alone move the lens by another 0.014 mm; so the noise is put on the
-    *lens* pose, and that pose is carried to the body. The lens position computed from the reported body
-    pose and the true transform then has an RMS error of exactly ``translation_error``, whatever the lever.
+    The paper states the error at the lens. An independent rotation error of 0.004 degrees on a lever of
+    0.2 m would alone move the lens by another 0.014 mm. So the noise is added to the *lens* pose, and that
+    pose is transformed to the body. The lens position computed from the reported body pose and the true
+    transform then has an RMS error of exactly ``translation_error``, whatever the lever.
     """
     count = len(T_world_lens)
     sigma = np.array([noise.translation_error, noise.rotation_error]) / np.sqrt(3.0)
@@ -48,12 +48,12 @@ def tracked_body(
 def track_lens(
     T_world_lens: Array, T_body_lens: Array, seed: int, noise: TrackerNoise | None = None
 ) -> Array:
-    """What the tracker reports (n, 4, 4) of the body for true lens poses, its noise drawn from a seed."""
+    """Reported body poses (n, 4, 4) for true lens poses, with noise drawn from a seed."""
     rng = np.random.default_rng([seed, 0x5452])
     return tracked_body(T_world_lens, T_body_lens, noise or TrackerNoise(), rng)
 
 
 def world_from_scene(seed: int) -> Array:
-    """``T_world_scene`` (4, 4): a knee somewhere in the tracker's volume, turned anyhow."""
+    """``T_world_scene`` (4, 4): a knee at a random pose in the tracker's volume."""
     rng = np.random.default_rng([seed, 0x574F])
     return from_rotation_vectors(rng.uniform(-1.2, 1.2, 3), rng.uniform([-0.5, 0.8, -0.5], [0.5, 1.2, 0.5]))

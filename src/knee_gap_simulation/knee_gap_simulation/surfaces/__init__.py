@@ -1,1 +1,1 @@
-"""Surfaces of tissue: distances to them, their shading and textures."""
+"""Surfaces of tissue: distance fields, shading, textures, and the instrument gap between them."""

@@ -1,4 +1,4 @@
-"""The surfaces of the knee as distances, and the rays that meet them: compiled kernels.
+"""Distance fields of the knee's surfaces and ray casting against them: compiled kernels.
 
 Scene frame: x along the gap, y across it (the femur is at negative y), z away from the lens. All lengths in
 metres. ``shape`` is the flat array of `KneeScene.constants`, ``waves`` its sine waves (n, 6), sorted by
@@ -13,10 +13,10 @@ from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
 
 CONDYLE, PLATEAU, MENISCUS, CAPSULE, PROBE = 0, 1, 2, 3, 4
-# Waves that bend a line, not a surface: height and depth of the ridge, and the free edge of the meniscus.
+# Waves of a line, not a surface: height and depth of the ridge, and the free edge of the meniscus.
 RIDGE_HEIGHT, RIDGE_DEPTH, FREE_EDGE = 5, 6, 7
 
-# Where the waves of surface s begin in the sorted array is kept at shape[WAVES + s].
+# shape[WAVES + s] is the index in the sorted array at which the waves of surface s begin.
 WAVES = 28
 
 _STEP_SHARE = 0.85
@@ -27,7 +27,7 @@ _C3, _C4 = -9.538676415369677, 3.077239184687607
 
 @compiled(nogil=True)
 def _sine(cycles: float) -> float:
-    """About sin(2 pi cycles), within 2e-7 and continuous; the ripples are by definition what this gives."""
+    """Approximation of sin(2 pi cycles) within 2e-7, continuous; the ripples are defined by it."""
     r = cycles - np.round(cycles)
     s = r * r
     p = 6.28318319075165 + s * (-16.208720030796144 + s * (16.762028054508296 + s * (_C3 + s * _C4)))
@@ -45,7 +45,7 @@ def ripple(x: float, y: float, z: float, surface: int, shape: Array, waves: Arra
 
 @compiled(nogil=True)
 def _ellipsoid(x: float, y: float, z: float, shape: Array, first: int) -> float:
-    """About the distance to an ellipsoid, centre and radii at shape[first : first + 6]; negative inside."""
+    """Approximate distance to an ellipsoid (centre and radii: shape[first : first + 6]); negative inside."""
     x, y, z = x - shape[first], y - shape[first + 1], z - shape[first + 2]
     rx, ry, rz = shape[first + 3], shape[first + 4], shape[first + 5]
     k0 = np.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
@@ -99,7 +99,7 @@ def ridge(x: float, shape: Array, waves: Array) -> tuple[float, float, float, fl
 def meniscus(x: float, y: float, z: float, shape: Array, waves: Array) -> float:
     """Distance to the meniscus: a wedge that rises from its free edge to a sharp rim, undercut behind it."""
     slope, hollow, width, undercut = shape[22], shape[23], shape[24], shape[25]
-    # Far off, a bound that needs no waves: the wedge lies below its highest rim and before its farthest.
+    # Far away, a bound without the waves: the wedge lies below its highest rim and before its farthest.
     above, behind = float(shape[26] - y), float(z - shape[27])
     if above > 1.5e-3 or behind > 1.5e-3:
         return max(above, behind)
@@ -108,7 +108,7 @@ def meniscus(x: float, y: float, z: float, shape: Array, waves: Array) -> float:
     falls = slope - 2.0 * hollow * before
     top = slope * before - hollow * before * before - below
     if before > 0.0:
-        # The ripples fade towards the rim, which stays where `ridge` has it.
+        # The ripples fade out towards the rim, so that it stays at `ridge`.
         top -= ripple(x, 0.0, z, MENISCUS, shape, waves) * before / (before + 0.5e-3)
     along = rim_dy + falls * rim_dz
     top /= np.sqrt(1.0 + falls * falls + along * along)
@@ -162,7 +162,7 @@ def surface_distance(
 
 @compiled(nogil=True)
 def field(x: float, y: float, z: float, shape: Array, waves: Array, probe: Array) -> tuple[float, int]:
-    """Distance to the nearest surface, never more than the true one, and which it is."""
+    """Distance to the nearest surface, never more than the true one, and the index of the surface."""
     nearest, surface = condyle(x, y, z, shape, waves), CONDYLE
     distance = plateau(x, y, z, shape, waves)
     if distance < nearest:
@@ -200,12 +200,12 @@ def march(
             origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz, shape, waves, probe
         )
         if distance < tolerance:
-            # One step too far: back to where the line through the last two distances is zero.
+            # One step too far: back to the zero of the line through the last two distances.
             if distance < -tolerance and before > 0.0:
                 t -= step * distance / (distance - before)
             return t, surface
         forward = _STEP_SHARE * distance
-        # Close to a surface the ray sees slanted, the last step tells how far it still is.
+        # Close to a surface at a slant, the last step predicts the remaining distance.
         if distance < _CLOSE and before > distance:
             forward = max(forward, min(2.0 * distance, step * distance / (before - distance)))
         before, step = distance, forward
@@ -225,7 +225,7 @@ def free_lengths(
     probe: Array,
     lengths: Array,
 ) -> None:
-    """How far cones of half angle ``spread`` [rad] around each direction (n, 3) are free of all surfaces."""
+    """Free length of cones of half angle ``spread`` [rad] around each direction (n, 3)."""
     for i in range(directions.shape[0]):
         t = 0.0
         for _ in range(_MAX_STEPS):
@@ -253,7 +253,7 @@ def polish(
     waves: Array,
     probe: Array,
 ) -> float:
-    """Length of a ray to a surface to rounding, from a length within a few micrometres of it."""
+    """Length of a ray to a surface, refined to rounding from a length within a few micrometres of it."""
     step = 1e-7
     for _ in range(6):
         here = surface_distance(
@@ -270,7 +270,7 @@ def polish(
             probe,
         )
         slope = (there - here) / step
-        # A grazing ray has no crossing to find: leave it where it came closest.
+        # A grazing ray has no crossing: keep its closest point.
         if slope > -1e-3:
             break
         change = -here / slope
@@ -310,7 +310,7 @@ def cast(
     surfaces: npt.NDArray[np.uint8],
     normals: Array,
 ) -> None:
-    """First surface along each ray, beginning ``starts`` along it; normals too."""
+    """First surface along each ray beyond ``starts``, with normals."""
     for i in range(directions.shape[0]):
         dx, dy, dz = directions[i]
         lengths[i] = np.nan
@@ -338,7 +338,7 @@ def light_reach(
     probe: Array,
     reach: Array,
 ) -> None:
-    """How much light gets to points (n, 3): reach (n, 2), from the lamp (soft shadow) and from all around."""
+    """Fractions of light that reach points (n, 3): reach (n, 2), of the lamp (soft shadow) and ambient."""
     for i in range(points.shape[0]):
         px, py, pz = points[i]
         nx, ny, nz = normals[i]
@@ -358,7 +358,7 @@ def light_reach(
         for _ in range(40):
             x, y, z = px + t * lx + 2e-5 * nx, py + t * ly + 2e-5 * ny, pz + t * lz + 2e-5 * nz
             distance, _ = field(x, y, z, shape, waves, probe)
-            # The lamp has a width: what passes close to the ray covers a part of it.
+            # The lamp has a width: a surface close to the ray covers a part of it.
             open_share = min(open_share, 0.5 + distance / (0.16 * t * (1.0 - t / far) + 1e-9))
             if open_share <= 0.0:
                 open_share = 0.0
@@ -397,7 +397,7 @@ def ridge_points(along: Array, shape: Array, waves: Array, result: Array) -> Non
 
 @compiled(nogil=True)
 def foot_on_condyle(point: Array, shape: Array, waves: Array, foot: Array) -> None:
-    """The point (3,) of the condyle nearest to another: slide on the surface until nothing is left to."""
+    """The point (3,) of the condyle nearest to another, by sliding on the surface until it converges."""
     probe = np.zeros((0, 4))
     foot[:] = point
     for _ in range(200):

@@ -4,11 +4,11 @@
 
 c is where the axis of the instrument crosses the section E0 E1 of the opening, u its direction within a cone
 about the direction of view v, and p any point of tissue at most ``REACH`` before or behind the section along
-the axis and not before the lens. What is asked of the tissue is only a set of points on it, so that any scene
-that can be sampled, a mesh too, has an instrument gap.
+the axis and not before the lens. The tissue is given as a set of points on it, so any scene that can be
+sampled, a mesh for example, has an instrument gap.
 
-The maximum is found by a scan over s and two tilts, and then by sequential linear programming: the distances
-of the nearest points are linearised within a region of trust that shrinks where that does not help.
+The maximum is found by a scan over s and two tilts, followed by sequential linear programming: the distances
+of the nearest points are linearised within a trust region, which shrinks if a step does not improve the gap.
 """
 
 from typing import NamedTuple
@@ -22,22 +22,22 @@ from knee_gap_simulation.errors import SimulationError
 
 IntArray = npt.NDArray[np.int64]
 
-# Half angle [rad] of the cone about the direction of view within which the instrument is directed.
+# Half angle of the cone about the direction of view that contains the instrument's direction [rad].
 CONE = float(np.radians(10.0))
-# How far [m] along its axis, before and behind the section, the instrument meets no tissue.
+# Length along the axis before and behind the section over which the instrument touches no tissue [m].
 REACH = 0.010
 
-_BLOCK = 1.0e-3  # edge [m] of the cubes by which points are passed over
-_CROSSINGS = 11  # places of the axis on the section in the scan
-_CROSSING_STEP = 1e-6  # [m]: how well each tilt's best place is found
+_BLOCK = 1.0e-3  # edge [m] of the cubes into which points are sorted
+_CROSSINGS = 11  # positions of the axis on the section in the scan
+_CROSSING_STEP = 1e-6  # [m]: accuracy of each tilt's best position
 _RINGS = 6  # rings of tilts in the scan
 _STARTS = 5  # maxima of the scan that are followed
 _LEVER = 5.0e-3  # [m]: a tilt counts as much as a shift of the axis at this distance
-_TRUST = 0.4e-3  # region of trust [m] at the start
-_LEAST_TRUST = 2e-8  # [m]: small enough to stop
+_TRUST = 0.4e-3  # initial trust region [m]
+_LEAST_TRUST = 2e-8  # trust region [m] at which the search stops
 _ROUNDS = 60
 _TANGENTS = 24  # of the cone, in the linear programme
-_MOST_POINTS = 1500  # that it takes one by one
+_MOST_POINTS = 1500  # in the linear programme
 
 
 class InstrumentGap(NamedTuple):
@@ -97,9 +97,9 @@ class TissuePoints(NamedTuple):
 
 
 class _Extent(NamedTuple):
-    """Which tissue counts: within ``reach`` [m] of the section along an axis, and not before the lens.
+    """Region in which tissue counts: within ``reach`` [m] of the section along an axis, not before the lens.
 
-    That is at a depth of ``lens`` [m] along the direction of view (3,).
+    The lens is at a depth of ``lens`` [m] along the direction of view (3,).
     """
 
     reach: float
@@ -154,12 +154,12 @@ class _Search:
         self._across = (edges[1] - edges[0]) / self._width
         within = self._across - (self._across @ view) * view
         if not np.linalg.norm(within) > 1e-3:
-            raise SimulationError("the view runs along the section of the opening: nothing passes there")
+            raise SimulationError("the direction of view lies along the section: no instrument passes there")
         within /= np.linalg.norm(within)
         # The first tilt turns the axis along the opening, the second within the section's plane.
         self._tilts = np.stack([np.cross(view, within), within])
         self._most = float(_LEVER * np.tan(cone))
-        # No instrument is thicker than the edges are apart: they are tissue themselves.
+        # No instrument is thicker than the distance between the edges: they are tissue themselves.
         radius = self._width + 1.05 * extent.reach * np.tan(cone)
         far = (extent.reach + self._width) / np.cos(cone)
         near, own = tissue.around(edges.mean(axis=0), view, radius, far), TissuePoints.of(edges)
@@ -198,7 +198,7 @@ class _Search:
         return starts[:_STARTS]
 
     def refined(self, place: Array) -> tuple[float, Array]:
-        """The greatest free radius [m] that is reached from a place, and where."""
+        """Largest free radius [m] found from a starting place, and its place."""
         best, trust = _free_radius(self._tissue, *self.axis(place), self._extent, 0.0), _TRUST
         for _ in range(_ROUNDS):
             proposed = self._proposed(place, best, trust)
@@ -213,7 +213,7 @@ class _Search:
         return best, place
 
     def _proposed(self, place: Array, free: float, trust: float) -> Array:
-        """The best place within the trust according to the linearised distances."""
+        """Best place within the trust region by the linearised distances."""
         crossing, direction = self.axis(place)
         nearest = _nearest_points(self._tissue, crossing, direction, self._extent, free + 6.0 * trust)
         away = self._tissue.points[nearest] - crossing
@@ -229,16 +229,16 @@ class _Search:
         low[0], high[0] = max(low[0], -place[0]), min(high[0], self._width - place[0])
         if not self._most > 0.0:
             low[1:] = high[1:] = 0.0
-        # The cone as its tangents, one of them where the place lies; what is left over is cut off below.
+        # The cone as its tangents, one of them at the place itself; the rest is cut off below.
         angles = np.arctan2(place[2], place[1]) + np.arange(_TANGENTS) * (2.0 * np.pi / _TANGENTS)
         tangents = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         rows = np.zeros((6 + len(distances) + _TANGENTS, 4))
         rows[:3, :3], rows[3:6, :3] = np.eye(3), -np.eye(3)
         rows[6:-_TANGENTS, :3], rows[6:-_TANGENTS, 3] = slopes, 1.0
         rows[-_TANGENTS:, 1:3] = tangents
-        # A place at the border may lie beyond a tangent by rounding; the box's corner must not.
+        # By rounding, a place at the border may lie beyond a tangent; the box's corner must not.
         room = np.maximum(self._most - tangents @ place[1:], 0.0)
-        # In units of the trust, so that tolerances mean the same in every round.
+        # In units of the trust region, so that tolerances mean the same in every round.
         limits = np.concatenate([high, -low, distances - free, room]) / trust
         proposed = place + trust * _highest(rows, limits)[:3]
         tilt = float(np.linalg.norm(proposed[1:]))
@@ -305,14 +305,14 @@ def _scan(
     direction: Array,
     extent: _Extent,
 ) -> tuple[float, float]:
-    """The greatest free radius of parallel axes that cross the section, and where it does [m]."""
+    """Largest free radius of parallel axes that cross the section, and the place of the crossing [m]."""
     best, crossing = 0.0, 0.5 * width
     for k in range(_CROSSINGS):
         s = width * (k + 0.5) / _CROSSINGS
         free = _free_radius(tissue, start + s * across, direction, extent, best)
         if free > best:
             best, crossing = free, s
-    # From one side the tissue above is nearest, from the other that below: narrow the best place in.
+    # On one side the tissue above is nearest, on the other the tissue below: bisect for the best place.
     step = width / _CROSSINGS
     while step > _CROSSING_STEP:
         step *= 0.5
@@ -334,7 +334,7 @@ def _nearest_in_block(
         along = x * direction[0] + y * direction[1] + z * direction[2]
         if abs(along) > extent.reach:
             continue
-        # Not as a difference of squares, which loses half of the digits.
+        # A difference of squares would lose half of the digits.
         x, y, z = x - along * direction[0], y - along * direction[1], z - along * direction[2]
         squared = x * x + y * y + z * z
         if squared < best:
@@ -346,7 +346,7 @@ def _nearest_in_block(
 
 @compiled(nogil=True)
 def _room(tissue: TissuePoints, k: int, crossing: Array, direction: Array, reach: float) -> float:
-    """No point of a block is nearer to the axis than this; infinite for a block out of reach."""
+    """Lower bound of the distance of a block's points from the axis; infinite for a block out of reach."""
     x = tissue.centres[k, 0] - crossing[0]
     y = tissue.centres[k, 1] - crossing[1]
     z = tissue.centres[k, 2] - crossing[2]

@@ -1,4 +1,4 @@
-"""Light from the scope's tip on wet tissue."""
+"""Shading of wet tissue under the light at the scope's tip."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,11 @@ class Light:
     """The light at the tip: a small lamp beside the lens, brightest straight ahead.
 
     ``position`` [m] is in the lens frame. ``spread`` is the exponent of the cosine with which it falls off
-    to the side. ``reference`` [m] is the distance where it gives unit irradiance; ``absorption`` [1/m] of
-    the fluid dims what is far away, on the way there and back; ``ambient`` is what the joint scatters.
-    ``glare`` scales the mirror-like reflection of the wet surface, ``shininess`` is its exponent, ``glint``
-    how much the relief scatters it, ``sheen`` the share of its wide part. ``facing_exponent`` < 1 keeps
-    surfaces seen aslant brighter than Lambert's law does, as light that comes back out of cartilage does.
+    to the side. ``reference`` [m] is the distance of unit irradiance; ``absorption`` [1/m] of the fluid dims
+    distant tissue, on the way there and back; ``ambient`` is the light scattered by the joint.
+    ``glare`` scales the specular reflection of the wet surface, ``shininess`` is its exponent, ``glint`` its
+    scattering by the relief, ``sheen`` the fraction of its wide part. ``facing_exponent`` < 1 makes slanted
+    surfaces brighter than Lambert's law, as subsurface scattering does in cartilage.
     """
 
     position: tuple[float, float, float] = (0.0004, -0.0014, -0.0002)
@@ -49,8 +49,8 @@ def shade(
     """Linear radiance (n, 3), blue green red, of surface points seen from the lens.
 
     points, normals: (n, 3) in the scene frame; uv: (n, 2) [m] on the surface; surfaces: (n,) index into
-    ``textures`` (k, size, size, channels), NOTHING where the ray met nothing; reach: (n, 2) share of the
-    light of the lamp, and of the light from all around, that gets there (all of it by default).
+    ``textures`` (k, size, size, channels), NOTHING if the ray hit nothing; reach: (n, 2) fractions of the
+    lamp's light and of the ambient light that reach the points (1 by default).
     """
     eye = T_scene_lens[:3, 3]
     lamp = T_scene_lens[:3, :3] @ np.asarray(light.position) + eye

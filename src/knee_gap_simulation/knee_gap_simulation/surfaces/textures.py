@@ -1,4 +1,4 @@
-"""Tissue as periodic pictures: colour, fine relief and gloss, made from seeded noise."""
+"""Textures of tissue: periodic colour, fine relief and gloss, made from seeded noise."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ CHANNELS = 6
 
 @dataclass(frozen=True)
 class Tissue:
-    """How one kind of tissue looks.
+    """Appearance of one kind of tissue.
 
     Colours are sRGB (red, green, blue) in [0, 255]. ``mottle`` (0.5-3 mm), ``grain`` (0.1-0.4 mm) and
     ``fibres`` (streaks along u) are the RMS of the relative change of brightness; ``relief`` is the RMS

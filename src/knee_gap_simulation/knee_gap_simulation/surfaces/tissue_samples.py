@@ -1,4 +1,4 @@
-"""Points on the tissue around an opening, exactly on its surfaces and dense: what an instrument may touch."""
+"""Dense samples of the tissue around an opening, exactly on its surfaces."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from knee_gap_simulation.surfaces.distance_field import (
     surface_distance,
 )
 
-# The tissue above the opening, below it, and what closes the joint around both.
+# Sides of the opening: the tissue above it, below it, and the wall of the joint around both.
 UPPER_SIDE, LOWER_SIDE, AROUND = 0, 1, 2
 
 SPACING = 0.06e-3  # of points on a surface [m]
@@ -39,7 +39,7 @@ def joined(parts: list[tuple[int, Array]], centre: Array, reach: float) -> Tissu
     """The points of several surfaces, each on one side, that lie within ``reach`` [m] of a centre (3,)."""
     points = np.concatenate([part for _, part in parts])
     sides = np.concatenate([np.full(len(part), side, np.int64) for side, part in parts])
-    # NaN compares as false: what is not on a surface is not kept.
+    # NaN compares as false: points that are not on a surface are dropped.
     kept = ((points - centre) ** 2).sum(axis=1) <= reach * reach
     return TissueSamples(np.ascontiguousarray(points[kept]), sides[kept])
 
@@ -52,7 +52,7 @@ def angles_off(origin: Array, direction: Array, points: Array) -> Array:
 
 
 def steps(low: float, high: float, spacing: float) -> Array:
-    """Places from low to high, both included, at most ``spacing`` apart; none if high is below low."""
+    """Positions from low to high, both included, at most ``spacing`` apart; empty if high is below low."""
     if not high >= low:
         return np.empty(0)
     return np.linspace(low, high, int(np.ceil((high - low) / spacing)) + 1)
@@ -106,9 +106,9 @@ def _ellipsoid_points(
     centre: Array,
     reach: float,
 ) -> Array:
-    """Points on a rippled ellipsoid: rings around its x axis, moved along rays from its middle onto it."""
+    """Points on a rippled ellipsoid: rings around its x axis, projected along rays from its centre."""
     middle, radii = shape[first : first + 3], shape[first + 3 : first + 6]
-    # Rings at equal angles from the x axis, so that their spacing holds near its ends too.
+    # Rings at equal angles from the x axis, so that they are dense enough near its ends too.
     angles = steps(0.0, np.pi, spacing / radii.max())
     x = middle[0] - radii[0] * np.cos(angles)
     margin = 2e-3
@@ -195,7 +195,7 @@ def _on_meniscus(wedge: Array, shape: Array, waves: Array, faces: Array) -> None
 def _fall(
     x: float, before: float, rim_z: float, shape: Array, waves: Array, slope: float, hollow: float
 ) -> float:
-    """How far below the rim the top of the meniscus is, at a distance before it."""
+    """Depth of the top of the meniscus below the rim, at a distance before it."""
     fall = slope * before - hollow * before * before
     if before > 0.0:
         fall -= ripple(x, 0.0, rim_z - before, MENISCUS, shape, waves) * before / (before + 0.5e-3)
