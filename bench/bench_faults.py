@@ -26,6 +26,7 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_replay.pipeline import PARAMETERS, GapPipeline
 from knee_gap_replay.processing import by_stamp
@@ -38,7 +39,6 @@ from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
 )
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
-from knee_gap_simulation.rigid import from_parts
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 
@@ -90,7 +90,7 @@ class Recording:
         pose = self.poses.get(stamp) or self.poses[min(self.poses, key=lambda known: abs(known - stamp))]
         p, q = pose.position, pose.orientation
         rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-        return true_gap(self.scene, from_parts(rotation, [p.x, p.y, p.z]), edges)
+        return true_gap(self.scene, rigid(rotation, [p.x, p.y, p.z]), edges)
 
     def with_fault(self, fault: Fault) -> Iterator[tuple[str, Any, int]]:
         """The messages with a fault, in the order of the stamps that they have then."""
