@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from knee_gap_bringup.comparison import true_gap
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.gap_estimate import EdgeState, GapEstimate, GapStatus
 from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_replay.pipeline import PARAMETERS, GapPipeline
@@ -84,13 +83,13 @@ class Recording:
         farthest = places[np.argmax(np.linalg.norm(places - places[0], axis=1))] - places[0]
         return cls(stamped, scene, poses, farthest / np.linalg.norm(farthest))
 
-    def truth(self, stamp: int, edges: Any) -> float:
-        """True instrument gap [m] of the section that a GapEdges of an image's stamp [ns] shows."""
+    def truth(self, stamp: int, edges: "SeenEdges") -> float:
+        """True instrument gap [m] of the section whose edges an image of a stamp [ns] shows."""
         # A fault of the image clock shifts the stamps; what the image shows, it shows of its own time.
         pose = self.poses.get(stamp) or self.poses[min(self.poses, key=lambda known: abs(known - stamp))]
         p, q = pose.position, pose.orientation
         rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-        return true_gap(self.scene, rigid(rotation, [p.x, p.y, p.z]), edges)
+        return self.scene.reported_gap(rigid(rotation, [p.x, p.y, p.z]), edges.bearings, edges.pixels)
 
     def with_fault(self, fault: Fault) -> Iterator[tuple[str, Any, int]]:
         """The messages with a fault, in the order of the stamps that they have then."""
@@ -207,12 +206,19 @@ class Recorder:
         return call
 
 
+class SeenEdges(NamedTuple):
+    """Edges (2, 3) that an image shows, NaN unless it shows both, and the tracked pixels (2, 2) [px]."""
+
+    bearings: Array
+    pixels: Array
+
+
 @dataclass
 class Outcome:
     """What the estimator was called with under a fault, and the edges of each image by its stamp [ns]."""
 
     calls: list[tuple[str, tuple[Any, ...]]]
-    edges: dict[int, Any]
+    edges: dict[int, SeenEdges]
 
 
 def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcome:
@@ -221,17 +227,21 @@ def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcom
     pipeline = GapPipeline.from_parameters(file, topics, SPACE)
     recorder = Recorder(file.build("uncertainty_node", [EstimatorParameters])[0])
     pipeline._estimator = recorder  # type: ignore[assignment]
-    edges: dict[int, Any] = {}
+    edges: dict[int, SeenEdges] = {}
     for topic, message, stamp in recording.with_fault(fault):
         _note_edges(pipeline.feed(topic, message, stamp), edges)
     _note_edges(pipeline.finish(), edges)
     return Outcome(recorder.calls, edges)
 
 
-def _note_edges(outputs: Any, edges: dict[int, Any]) -> None:
+def _note_edges(outputs: Any, edges: dict[int, SeenEdges]) -> None:
     for output in outputs:
         if output.topic == f"{SPACE}/gap_edges":
-            edges[output.stamp_ns] = output.message
+            seen = output.message
+            bearings = np.array([[one.x, one.y, one.z] for one in (seen.edge_0, seen.edge_1)])
+            if not seen.edge_state_0 == seen.edge_state_1 == EdgeState.SEEN:
+                bearings[:] = np.nan
+            edges[output.stamp_ns] = SeenEdges(bearings, np.array([seen.pixel_0, seen.pixel_1]))
 
 
 def estimated(outcome: Outcome, file: ParametersFile) -> tuple[list[GapEstimate], Counter[str]]:
@@ -257,7 +267,7 @@ class Row(NamedTuple):
     error: float
 
     @classmethod
-    def of(cls, found: Sequence[GapEstimate], recording: Recording, edges: dict[int, Any]) -> "Row":
+    def of(cls, found: Sequence[GapEstimate], recording: Recording, edges: dict[int, SeenEdges]) -> "Row":
         """Count estimates beside the true instrument gap of the section that their image shows."""
         valid = [one for one in found if one.status is GapStatus.VALID]
         truth = np.array([recording.truth(one.stamp_ns, edges[one.stamp_ns]) for one in valid])
