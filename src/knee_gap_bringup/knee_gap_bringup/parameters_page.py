@@ -1,4 +1,4 @@
-"""The page docs/parameters.md, with every parameter of every node; run as a module, it prints the page."""
+"""The page docs/how/parameters.md, every parameter of every node; run as a module, it prints the page."""
 
 import sys
 from collections.abc import Iterator

@@ -3,7 +3,7 @@
     tools/env python -m knee_gap_bringup.simulated_calibration bags/sample
 
 writes calibration.yaml to the bag's folder. Its standard errors are those of `calibrate all` on a simulated
-calibration bag (docs/calibration.md). Its values deviate from the true ones by errors drawn from them, so
+calibration bag (docs/how/calibration.md). Its values deviate from the true ones by errors drawn from them, so
 that the stated accuracy is tested.
 """
 

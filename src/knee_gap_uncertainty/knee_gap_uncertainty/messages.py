@@ -1,5 +1,6 @@
 """Messages to observations and estimates to messages, by field name: any classes with those fields serve."""
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -25,23 +26,7 @@ SHARES = (
     "share_shape",
 )
 # Plain numbers of GapEstimate, under the same name in the message.
-NUMBERS = (
-    "gap",
-    "gap_min",
-    "gap_max",
-    "snr",
-    "confidence_level",
-    "confidence_min",
-    "confidence_max",
-    "point_distance",
-    "point_distance_min",
-    "point_distance_max",
-    "point_distance_confidence_min",
-    "point_distance_confidence_max",
-    "baseline",
-    "parallax",
-    "translation_to_target",
-)
+NUMBERS = tuple(field.name for field in fields(GapEstimate) if field.type is float)
 
 
 def edges_from_message(message: Any) -> EdgeObservation:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from knee_gap_bringup.parameters_page import page
 
-PAGE = Path(__file__).parents[3] / "docs" / "parameters.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how" / "parameters.md"
 
 
 def test_page_in_the_docs_is_the_one_that_is_printed() -> None:

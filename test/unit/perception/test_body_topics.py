@@ -201,7 +201,6 @@ class TestScopeFeed:
         assert SourceParameters(source=source, up_axis=up_axis).resolved_up_axis() == meant
 
     def test_an_unknown_source_is_refused_with_those_there_are(self):
-        with pytest.raises(
-            PerceptionError, match="source must be one of pose, rigid_bodies, natnet, not 'vicon'"
-        ):
+        choices = ", ".join(SOURCES)
+        with pytest.raises(PerceptionError, match=f"source must be one of {choices}, not 'vicon'"):
             SourceParameters(source="vicon")

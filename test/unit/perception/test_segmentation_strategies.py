@@ -10,7 +10,7 @@ import pytest
 
 from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK, segmentation_named
+from knee_gap_perception.segmentation.choice import STRATEGIES, WITHOUT_NETWORK, segmentation_named
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.three_classes import otsu3
 from knee_gap_perception.segmentation.thresholds import otsu_threshold
@@ -87,7 +87,7 @@ def test_light_that_falls_to_the_rim_is_evened(drawn: tuple[Image, Mask, Mask]) 
 
 
 def test_unknown_names_are_refused_with_the_choices() -> None:
-    with pytest.raises(PerceptionError, match="otsu, otsu3, adaptive, watershed, chan_vese, onnx"):
+    with pytest.raises(PerceptionError, match=", ".join(STRATEGIES)):
         segmentation_named("unet")
 
 

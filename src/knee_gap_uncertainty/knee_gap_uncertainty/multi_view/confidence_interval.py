@@ -2,7 +2,7 @@
 
 The ellipsoid lies in direction and inverse depth, where the likelihood is near Gaussian down to small
 parallax; the distance is not linear there, so the interval is asymmetric and its upper end is infinite as
-soon as the ellipsoid reaches infinity. `docs/coverage.md` shows how often it holds the truth.
+soon as the ellipsoid reaches infinity. `docs/results/coverage.md` shows how often it holds the truth.
 """
 
 from dataclasses import dataclass

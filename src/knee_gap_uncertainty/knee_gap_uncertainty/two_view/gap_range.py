@@ -24,8 +24,8 @@ LARGEST_ANGULAR_ERROR = math.pi / 2
 MOST_RADII = 30
 # Where the volumes that worst-case clouds sample come nearer than this share of the least distance of the
 # samples, the rings are too wide beside the gap for eight points each to bound it from below, and the
-# distance of the volumes does. Above it no simulated error passes between the samples (`docs/coverage.md`),
-# and they stand, so that the number is the one that the paper's equations give.
+# distance of the volumes does. Above it no simulated error passes between the samples
+# (`docs/results/coverage.md`), and they stand, so that the number is the one that the paper's equations give.
 SPARSE = 0.82
 # The same between the clouds of one lens and of the other.
 FAR_NEARER = 0.5
