@@ -95,7 +95,7 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["hand_eye", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "5", "--end", "2"], "lie before"),
         (["pivot", "BAG", "--into", "OUT", "--begin", "1e300"], "lie before"),
         (["pivot", "BAG", "--into", "OUT", "--time-offset", "1e300"], "--time-offset must lie within 10 s"),
-        (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "a folder that may be written"),
+        (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "in a writable folder"),
         (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
         (

@@ -1,4 +1,4 @@
-"""A segmentation strategy by its name."""
+"""Factory of segmentation strategies by name."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,9 +12,9 @@ STRATEGIES = ("otsu", "otsu3", "adaptive", "watershed", "chan_vese", "onnx")
 
 
 def segmentation_named(name: str, **settings: Any) -> Segmentation:
-    """The strategy of a name in STRATEGIES, with the settings of its class.
+    """Return the strategy of a name in STRATEGIES, with the settings of its class.
 
-    Raises PerceptionError for an unknown name and for what the strategy itself refuses.
+    Raises PerceptionError for an unknown name and for settings that the strategy refuses.
     """
     simple: dict[str, Callable[..., Segmentation]] = {
         "otsu": Otsu,
@@ -23,7 +23,7 @@ def segmentation_named(name: str, **settings: Any) -> Segmentation:
     }
     if name in simple:
         return simple[name](**settings)
-    # Imported by need: the library behind these takes a second to load.
+    # Imported only if needed: their library takes a second to load.
     if name == "watershed":
         from knee_gap_perception.segmentation.flooding import Watershed
 
