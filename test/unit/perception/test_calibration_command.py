@@ -77,7 +77,7 @@ def test_steps_of_a_bag(bag: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["intrinsics", "BAG", "--into", "OUT"], "Say --board"),
+        (["intrinsics", "BAG", "--into", "OUT"], "Name it with --board"),
         (["intrinsics", "BAG", "--into", "OUT", "--board", "chess"], "a board is charuco"),
         (
             ["intrinsics", "BAG", "--into", "OUT", "--board", "dots:4x11:2", "--views", "6"],
@@ -182,9 +182,9 @@ def test_all_steps_are_those_that_bags_are_named_for(step_bags: tuple[Path, Path
         (["BOARD", "PIVOT"], "of several bags each is one step: name them board=BAG"),
         (["board=BOARD", "PIVOT"], "which step is it?"),
         (["board=BOARD", "board=PIVOT"], "two bags are named for the step board"),
-        (["pivot=PIVOT"], "no bag was named for the step 'board'; there are pivot"),
+        (["pivot=PIVOT"], "no bag is named for the step 'board'; there are pivot"),
         (["board=BOARD", "pivot=BAG"], "overlap in time"),
-        (["board=BOARD", "pivot=PIVOT", "--end", "3"], "several are given"),
+        (["board=BOARD", "pivot=PIVOT", "--end", "3"], "several bags are given"),
         (["board=NOWHERE"], "does not exist"),
         (["bored=BOARD"], "does not exist"),
     ],
