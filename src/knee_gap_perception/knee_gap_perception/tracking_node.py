@@ -1,4 +1,4 @@
-"""tracking_node: the tracked scope in, from a topic or Motive; scope_pose, the lens with its error, out."""
+"""tracking_node: poses of the tracked scope in, from topics or Motive; scope_pose, with its error, out."""
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,14 +27,14 @@ from knee_gap_perception.trackers.pose_topic import PoseTopics
 from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
 from knee_gap_perception.trackers.scope_feed import SCOPE, ScopeFeed, SourceParameters
 
-# After so many diagnostics, one a second, a source that still gives nothing is told in the log as well.
+# Number of diagnostics, one per second, after which a source without data is reported in the log as well.
 DIAGNOSTICS_TO_LOG = 5
-# How long one look at NatNet's socket may wait [s]: as long as the node may take to end.
+# Longest wait at NatNet's socket [s], which also limits the time to end the node.
 NATNET_WAIT = 0.1
 
 
 class TrackingNode(BaseNode):
-    """Converts, calls the tracker, publishes; a pose that is refused is not published at all."""
+    """Converts, calls the tracker, publishes. A rejected pose is not published."""
 
     def __init__(self) -> None:
         super().__init__("tracking_node", health=self.health)
@@ -43,9 +43,9 @@ class TrackingNode(BaseNode):
         source, natnet = self.declare(SourceParameters), self.declare(NatNetParameters)
         self.refuse_unknown_parameters()
         self._accepted_before = 0
-        # Since the last diagnostics, and why the last of them was.
+        # Number of rejected poses since the last diagnostics, and the reason of the last one.
         self._refused, self._why_refused = 0, ""
-        # Diagnostics in a row without a sound source.
+        # Number of diagnostics in a row without a working source.
         self._silent = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
@@ -69,7 +69,7 @@ class TrackingNode(BaseNode):
             medium=calibration.used_in,
         )
         self._calibration.publish(reported)
-        # Images and what Motive sends come in threads of their own.
+        # Images and Motive's frames arrive in threads of their own.
         self._one_at_a_time = threading.Lock()
         if calibration.scope_rotation_notch:
             self.create_subscription(ScopeNotch, "scope_notch", self.on_notch, RESULT_QOS)
@@ -84,11 +84,11 @@ class TrackingNode(BaseNode):
             self._receiver.start()
 
     def now_ns(self) -> int:
-        """Time of ROS, which NatNet's exposures are mapped to."""
+        """ROS time, to which NatNet's exposure times are mapped."""
         return int(self.get_clock().now().nanoseconds)
 
     def listen_to_poses(self, source: PoseTopics, parameters: TrackingParameters) -> None:
-        """Subscribe to the scope's pose, the leg's where one is the reference, a second body of the scope."""
+        """Subscribe to the scope body, and to the leg and a second scope body if they are configured."""
         topics = {
             SCOPE: "scope_body/pose",
             parameters.reference_body: "reference_body/pose",
@@ -102,7 +102,7 @@ class TrackingNode(BaseNode):
             )
 
     def listen_to_rigid_bodies(self, source: RigidBodiesTopic) -> None:
-        """Subscribe to all bodies at once. Raises ConfigurationError where the messages are not installed."""
+        """Subscribe to all bodies at once. Raises ConfigurationError if the messages are not installed."""
         try:
             from mocap4r2_msgs.msg import RigidBodies  # an optional package, needed by this source only
         except ImportError as error:
@@ -114,18 +114,18 @@ class TrackingNode(BaseNode):
         )
 
     def on_message(self, put: Any, message: Any) -> None:
-        """Take a message into the source, and publish what it completes."""
+        """Pass a message to the source, and publish the poses of the frames that it completes."""
         put(message)
         self.publish_polled(0.0)
 
     def receive(self) -> None:
-        """Publish what Motive sends, until the node ends; in a thread of its own, because it waits."""
+        """Publish the poses from Motive until the node ends; in a thread of its own, because it waits."""
         poll = self.guarded("frame of NatNet", partial(self.publish_polled, NATNET_WAIT))
         while not self._ended.is_set():
             faults = self.seam.counts.total()
             poll()
             if self.seam.counts.total() > faults:
-                # What raises at once whenever it is looked at must not take the whole processor.
+                # A source that always raises at once must not use the whole processor.
                 self._ended.wait(NATNET_WAIT)
 
     def publish_polled(self, timeout: float) -> None:
@@ -135,12 +135,12 @@ class TrackingNode(BaseNode):
                 self.publish_lenses(self._tracker.take(body, others))
 
     def on_notch(self, message: ScopeNotch) -> None:
-        """Take where the notch is in an image, and publish the pose of the lens at its stamp."""
+        """Receive the notch in an image, and publish the lens pose at its stamp."""
         with self._one_at_a_time:
             self.publish_lenses(self._tracker.take_notch(notch_from_message(message)))
 
     def recover(self, fault: Fault) -> None:
-        """Start the tracker afresh; the pose that raised is not published."""
+        """Reset the tracker; the pose that raised is not published."""
         with self._one_at_a_time:
             self._tracker.reset()
         self._refused, self._why_refused = self._refused + 1, fault.reason
@@ -154,10 +154,10 @@ class TrackingNode(BaseNode):
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
                 self._refused, self._why_refused = self._refused + 1, lens.detail
-                self.log_once(lens.reason, f"pose refused: {lens.detail}")
+                self.log_once(lens.reason, f"pose rejected: {lens.detail}")
 
     def destroy_node(self) -> None:
-        """End the receiver before what it publishes with."""
+        """End the receiver before the publishers that it uses."""
         self._ended.set()
         if self._receiver is not None:
             self._receiver.join()
@@ -165,7 +165,7 @@ class TrackingNode(BaseNode):
         super().destroy_node()
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """How the source fares, how many poses were accepted since the last time, and what was refused."""
+        """Status of the source, and poses accepted and rejected since the last diagnostics."""
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
         source = self._feed.status()
@@ -179,7 +179,7 @@ class TrackingNode(BaseNode):
         if source.ok and not accepted and self._tracker.notch_flaw:
             words = self._tracker.notch_flaw
         elif source.ok and self._refused:
-            words += f", {self._refused} refused: {self._why_refused}"
+            words += f", {self._refused} rejected: {self._why_refused}"
         self._refused = 0
         counts: dict[str, object] = {
             "calibration": hash_or_none(self._tracker.calibration),

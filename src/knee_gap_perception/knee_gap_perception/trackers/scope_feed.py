@@ -1,4 +1,4 @@
-"""The tracked scope from whichever source a lab has, and what is wrong when it does not come."""
+"""Feed of the tracked scope from the configured source, with a diagnosis if there are no data."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -13,19 +13,19 @@ from knee_gap_perception.trackers.rigid_bodies import RigidBodiesTopic
 from knee_gap_perception.trackers.up_axis import UP_AXES
 
 SOURCES = ("pose", "rigid_bodies", "natnet")
-# Name of the scope's body where each body has its own topic.
+# Name of the scope's body if each body has its own topic.
 SCOPE = "scope"
 
 
 @dataclass(frozen=True)
 class SourceParameters:
-    """Where tracked bodies come from. Raises PerceptionError for values outside their choices."""
+    """Source of tracked bodies. Raises PerceptionError for values outside their choices."""
 
     source: str = field(
         default="pose",
         metadata={
-            "description": "pose: geometry_msgs/PoseStamped, a topic a body; rigid_bodies: "
-            "mocap4r2_msgs/RigidBodies; natnet: straight from Motive",
+            "description": "pose: geometry_msgs/PoseStamped, one topic per body; rigid_bodies: "
+            "mocap4r2_msgs/RigidBodies; natnet: directly from Motive",
             "choices": SOURCES,
         },
     )
@@ -33,14 +33,14 @@ class SourceParameters:
         default="",
         metadata={
             "description": "Rigid body of the scope, by name or streaming id, for rigid_bodies and natnet; "
-            "empty is the only one there is"
+            "empty: the only body"
         },
     )
     up_axis: str = field(
         default="auto",
         metadata={
-            "description": "Axis that points up in what comes; auto is y for natnet, as Motive is set first, "
-            "and z for topics, as REP-103 wants it",
+            "description": "Axis that points up in the source's data; auto: y for natnet, Motive's default, "
+            "and z for topics, as in REP-103",
             "choices": ("auto", *UP_AXES),
         },
     )
@@ -49,7 +49,7 @@ class SourceParameters:
         check_parameters(self)
 
     def resolved_up_axis(self) -> str:
-        """Return the axis that is meant."""
+        """Return the up axis that applies."""
         if self.up_axis != "auto":
             return self.up_axis
         return "y" if self.source == "natnet" else "z"
@@ -58,8 +58,8 @@ class SourceParameters:
 class ScopeFeed:
     """The scope's body and the others of its frame, from the source that the parameters name.
 
-    Messages of topics are put into `source` by the node; NatNet is received here. Raises PerceptionError for
-    an address that cannot be used.
+    The node adds messages of topics to `source`; NatNet is received here. Raises PerceptionError for an
+    address that cannot be used.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class ScopeFeed:
         self._fault = ""
 
     def poll(self, timeout: float = 0.0) -> list[tuple[BodyPose, tuple[BodyPose, ...]]]:
-        """Return the scope's body and the others of each new frame in which the scope is told of.
+        """Return the scope's body and the others of each new frame that contains the scope.
 
         Only NatNet waits, for at most `timeout` [s].
         """
@@ -101,12 +101,12 @@ class ScopeFeed:
         return chosen
 
     def status(self) -> SourceStatus:
-        """Return how the source fares, and whether it has the body that is wanted."""
+        """Return the status of the source, and whether it has the wanted body."""
         status = self.source.status()
         if status.ok and self._fault:
             return SourceStatus(False, self._fault, status.values)
         return status
 
     def close(self) -> None:
-        """Let go of what the source holds."""
+        """Release the source's resources."""
         self.source.close()
