@@ -1,1 +1,1 @@
-"""What the scope sees and where it is: edges of the instrument gap and the pose of the lens."""
+"""Perception: the edges of the instrument gap in images, and the tracked pose of the lens."""

@@ -1,4 +1,4 @@
-"""Entry points of the package's executables, which can be stopped while their modules are imported."""
+"""Entry points of the package's executables. They can be stopped while their modules are imported."""
 
 from knee_gap_core.node.entry import entry
 

@@ -1,4 +1,4 @@
-"""Messages to images and edges to messages, by field name: ROS's own classes and any other serve alike."""
+"""Conversion of messages to images and poses, and of edges to messages, by field name, for any class."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
 
-# Channels of each accepted encoding and what makes it blue, green, red.
+# Channels of each accepted encoding, and its conversion to blue, green, red.
 ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bgr8": (3, None),
     "rgb8": (3, cv2.COLOR_RGB2BGR),
@@ -26,13 +26,13 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def refuse_stamp(header: Any) -> None:
-    """Raise PerceptionError for a stamp whose nanoseconds are a second or more: it is no time."""
+    """Raise PerceptionError for an invalid stamp, whose nanoseconds are a second or more."""
     if int(header.stamp.nanosec) > 999_999_999:
         raise PerceptionError(f"a stamp's nanoseconds must be below 1000000000, not {header.stamp.nanosec}")
 
 
 def _refuse_encoding(encoding: str) -> None:
-    """Raise PerceptionError unless the encoding is one that is read."""
+    """Raise PerceptionError unless the encoding is supported."""
     if encoding in ENCODINGS:
         return
     choices = ", ".join(ENCODINGS)
@@ -40,7 +40,7 @@ def _refuse_encoding(encoding: str) -> None:
         raise PerceptionError(f"a Bayer image ('{encoding}') must be debayered first, to one of {choices}")
     if "16" in encoding or "32" in encoding or "64" in encoding:
         raise PerceptionError(
-            f"an image must have 8 bits a channel, not '{encoding}'; encodings read: {choices}"
+            f"an image must have 8 bits per channel, not '{encoding}'; supported encodings: {choices}"
         )
     raise PerceptionError(f"the image encoding must be one of {choices}, not '{encoding}'")
 
@@ -48,7 +48,7 @@ def _refuse_encoding(encoding: str) -> None:
 def image_from_message(message: Any) -> Image:
     """Image (height, width, 3), blue green red, of a sensor_msgs/Image.
 
-    Raises PerceptionError for encodings that are not read, empty images, and data that do not fill the image.
+    Raises PerceptionError for unsupported encodings, empty images, and data that do not fill the image.
     """
     encoding = str(message.encoding)
     _refuse_encoding(encoding)
@@ -58,7 +58,7 @@ def image_from_message(message: Any) -> Image:
         raise PerceptionError(f"an image must have at least 1x1 px, not {width}x{height} px")
     if step < width * channels:
         raise PerceptionError(
-            f"{width} px in {encoding} take {width * channels} bytes a row, but the image's step is {step}"
+            f"{width} px in {encoding} take {width * channels} bytes per row, but the image's step is {step}"
         )
     data = np.frombuffer(message.data, dtype=np.uint8)
     if data.size < height * step:
@@ -75,19 +75,20 @@ def image_from_message(message: Any) -> Image:
 def image_from_compressed(message: Any) -> Image:
     """Image (height, width, 3), blue green red, of a sensor_msgs/CompressedImage (JPEG, PNG, ...).
 
-    Raises PerceptionError for data that are no image, more than 8 bits a channel, depth and Bayer images.
+    Raises PerceptionError for data that cannot be decoded, more than 8 bits per channel, and depth and Bayer
+    images.
     """
     description = str(message.format)
     encoding = description.split(";")[0].strip()
     if encoding.startswith("bayer"):
         _refuse_encoding(encoding)
     if "compressedDepth" in description:
-        raise PerceptionError(f"a depth image ('{description}') is not a picture of the scope")
+        raise PerceptionError(f"a depth image ('{description}') is not an image of the scope")
     data = np.frombuffer(message.data, dtype=np.uint8)
     if data.size == 0:
         raise PerceptionError("the compressed image is empty: 0 bytes")
     is_jpeg = data[:2].tobytes() == b"\xff\xd8"
-    # A JPEG has 8 bits; anything else is read unchanged first, so that 16 bits are refused rather than cut.
+    # A JPEG has 8 bits; other formats are read unchanged first, so that 16 bits are refused, not truncated.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if is_jpeg else cv2.IMREAD_UNCHANGED
     try:
         image = cv2.imdecode(data, flags)
@@ -98,7 +99,7 @@ def image_from_compressed(message: Any) -> Image:
     if image is None:
         raise PerceptionError(f"the compressed image ('{description}', {data.size} bytes) cannot be decoded")
     if image.dtype != np.uint8:
-        raise PerceptionError(f"an image must have 8 bits a channel, not {image.dtype}")
+        raise PerceptionError(f"an image must have 8 bits per channel, not {image.dtype}")
     if image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif image.shape[2] == 4:
@@ -109,8 +110,8 @@ def image_from_compressed(message: Any) -> Image:
 def lens_pose_from_message(message: Any) -> LensPose:
     """Lens pose of a geometry_msgs/PoseWithCovarianceStamped.
 
-    Raises PerceptionError for an invalid stamp, numbers that are not finite or beyond any tracker's, and a
-    quaternion that is not of unit length.
+    Raises PerceptionError for an invalid stamp, numbers that are not finite or out of range, and a quaternion
+    that is not of unit length.
     """
     refuse_stamp(message.header)
     place, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -120,7 +121,7 @@ def lens_pose_from_message(message: Any) -> LensPose:
     if not np.isfinite(np.concatenate([position, quaternion, covariance.ravel()])).all():
         raise PerceptionError("a lens pose must be finite")
     if not is_unit(quaternion):
-        raise PerceptionError(f"a lens pose must be turned by a unit quaternion, not {quaternion}")
+        raise PerceptionError(f"the quaternion of a lens pose must be of unit length, not {quaternion}")
     if np.abs(position).max() > FARTHEST or np.abs(covariance).max() > FARTHEST**2:
         raise PerceptionError(f"a lens pose and its error must lie within {FARTHEST:g} m, not {position} m")
     return LensPose(
@@ -173,7 +174,7 @@ def _fill_section(message: Any, section: SectionEdges) -> Any:
 
 
 def _camera_error(errors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Displacements (3, k), at most nine, as the message holds them (27,); NaN where there are none."""
+    """Displacements (3, k), at most nine, in the message's layout (27,); NaN if there are none."""
     count = errors.shape[1]
     padded = np.full((3, 9), 0.0 if count else np.nan)
     padded[:, :count] = errors

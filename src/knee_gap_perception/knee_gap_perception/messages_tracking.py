@@ -1,4 +1,4 @@
-"""Pose messages to bodies and lens poses to messages, by field name, whoever's classes they are."""
+"""Conversion of pose messages to bodies, and of lens poses to messages, by field name, for any class."""
 
 from math import isfinite, nan
 from typing import Any
@@ -12,11 +12,11 @@ from knee_gap_perception.camera.camera_errors import pupil_shift
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
 
-NO_REASON = "the notch is not seen, and no reason was told"
+NO_REASON = "the notch was not detected, and no reason was given"
 
 
 def body_pose_from_message(message: Any, name: str = "") -> BodyPose:
-    """Body of a geometry_msgs/PoseStamped, unchecked, as a driver of the tracker publishes it."""
+    """Body of a geometry_msgs/PoseStamped as published by a tracker driver, unchecked."""
     position, orientation = message.pose.position, message.pose.orientation
     return BodyPose(
         stamp_ns=stamp_ns(message.header),
@@ -58,9 +58,9 @@ def fill_scope_calibration(
 ) -> Any:
     """Set every field of a knee_gap_msgs/ScopeCalibration; returns the message.
 
-    `node` is who says it. Only tracking_node uses the lens on the body and the clock, and it alone may follow
-    the turn of the scope. In another `medium` than the calibration's (None: the same) the lens lies elsewhere
-    along its view.
+    `node` is the name of the publishing node. Only tracking_node uses the lens on the body and the clock, and
+    only it can track the rotation of the scope. In another `medium` than the calibration's (None: the same),
+    the lens is shifted along its view.
     """
     message.node, message.hash = node, calibration.hash if calibration else ""
     message.rotation_followed = rotation_followed
@@ -97,7 +97,7 @@ def fill_scope_notch(message: Any, observation: NotchObservation, frame_id: str)
 
 
 def notch_from_message(message: Any) -> NotchObservation:
-    """The sight of a knee_gap_msgs/ScopeNotch; numbers that are none are no sight, whatever it says."""
+    """The notch observation of a knee_gap_msgs/ScopeNotch; not seen if its numbers are invalid."""
     stamp = stamp_ns(message.header)
     reason = "" if message.seen else str(message.reason) or NO_REASON
     angle, error = float(message.angle), float(message.angle_error)

@@ -1,4 +1,4 @@
-"""Parameters as frozen dataclasses: one place for each default, its meaning and the values it may take."""
+"""Validation of parameters: frozen dataclasses with default, meaning and range in their metadata."""
 
 from typing import Any
 

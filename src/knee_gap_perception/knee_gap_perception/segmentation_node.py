@@ -1,4 +1,4 @@
-"""segmentation_node: images of the scope in; gap_edges, the two points beside the gap, out."""
+"""segmentation_node: images of the scope in; gap_edges (edges of the gap and two points beside them) out."""
 
 from collections.abc import Mapping, Sequence
 from time import time
@@ -32,7 +32,7 @@ from knee_gap_perception.warm_up import warm_up
 
 
 class SegmentationNode(BaseNode):
-    """Converts, calls the core, publishes; mask and overlay are made only while somebody listens."""
+    """Converts, calls the core, publishes. Mask and overlay are made only if they have subscribers."""
 
     def __init__(self) -> None:
         super().__init__("segmentation_node", health=self.health)
@@ -53,7 +53,7 @@ class SegmentationNode(BaseNode):
             )
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
-        # Compiled before the first image, so that its answer is not late.
+        # Compiled before the first image, so that its result is not late.
         warm_up()
         self._dropped = 0
         self._sequence: int | None = None
@@ -71,7 +71,7 @@ class SegmentationNode(BaseNode):
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
         self.create_service(Trigger, "restart", self.on_restart)
         self._poses = self.create_subscription(
-            # Reliable: lost on the way, poses would leave a gap that ends the track.
+            # Reliable, since lost poses would leave a gap that ends the track.
             PoseWithCovarianceStamped,
             "scope_pose",
             self.on_pose,
@@ -81,25 +81,25 @@ class SegmentationNode(BaseNode):
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         reported = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
         self._calibration.publish(reported)
-        # Runs while an image waits for its pose, so that it does not wait longer than it may.
+        # Runs while an image waits for its pose, so that it does not wait too long.
         self._patience = self.create_timer(max(poses.max_pose_wait, 0.001), self.publish_ready)
         self._patience.cancel()
 
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
-        """Take an image; it is looked at now, or once the pose that follows it is there."""
+        """Receive an image; it is processed now, or once the pose after it has arrived."""
         self.count_dropped(info.get("publication_sequence_number"))
         if (observation := self._stream.on_image(message, self.now_ns())) is not None:
-            # At once: the pose that the image waits for rests on it.
+            # At once, because the pose that the image waits for depends on it.
             self._notch.publish(fill_scope_notch(ScopeNotch(), observation, message.header.frame_id))
         self.publish_ready()
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Take a pose of the lens, which an image may have waited for."""
+        """Receive a lens pose, which an image may be waiting for."""
         self._stream.on_lens_pose(message)
         self.publish_ready()
 
     def publish_ready(self) -> None:
-        """Publish the edges in the images that wait no longer, and the pictures that anybody wants."""
+        """Publish the edges of the images that are ready, and the pictures that have subscribers."""
         self.take_waiting_poses()
         for edges in self._stream.ready(self.now_ns()):
             message = self.publish_edges(edges)
@@ -110,7 +110,7 @@ class SegmentationNode(BaseNode):
         self.set_patience()
 
     def publish_edges(self, edges: Edges) -> GapEdges:
-        """Publish what was found in one image; returns the message."""
+        """Publish the edges found in one image; return the message."""
         message = fill_gap_edges(GapEdges(), edges, GapSection)
         self._edges.publish(message)
         if self._stream.reason:
@@ -125,40 +125,40 @@ class SegmentationNode(BaseNode):
             self._patience.reset()
 
     def recover(self, fault: Fault) -> None:
-        """Start the stream afresh, and say of the image that raised that nothing is known of it."""
+        """Reset the stream, and publish unknown edges for the image that raised."""
         for edges in self._stream.recover(fault.reason):
             self.publish_edges(edges)
         self.set_patience()
 
     def take_waiting_poses(self) -> None:
-        """Take all poses that are there.
+        """Receive all poses that have arrived.
 
-        The executor takes one message of each topic a turn. Poses come twice as often as images, so that
-        where the machine is busy they would fall behind and be too old for every image.
+        The executor takes one message of each topic per cycle. Poses arrive twice as often as images, so on a
+        busy machine they would fall behind and be too old for every image.
         """
         with self._poses.handle:
             while (taken := self._poses.handle.take_message(PoseWithCovarianceStamped, False)) is not None:
                 self._stream.on_lens_pose(taken[0])
 
     def now_ns(self) -> int:
-        """Time by which waiting is measured; with use_sim_time the bag's, so slow replay waits longer."""
+        """Clock for waiting times; with use_sim_time the bag's, so that a slow replay waits longer."""
         return int(self.get_clock().now().nanoseconds)
 
     def on_click(self, message: PointStamped) -> None:
-        """As `choose_point`, for a pixel x column, y row; a refusal is told in the log."""
+        """As `choose_point`, for a pixel with x as column and y as row; a refusal is logged."""
         if reason := self._stream.choose(message.point.x, message.point.y):
-            self.get_logger().warning(f"clicked_point is not followed: {reason}")
+            self.get_logger().warning(f"clicked_point refused: {reason}")
 
     def on_choose(self, request: ChoosePoint.Request, answer: ChoosePoint.Response) -> ChoosePoint.Response:
-        """Choose the section nearest to a pixel, if the latest image shows a gap there."""
+        """Choose the section nearest to a pixel, if there is a gap in the latest image."""
         answer.reason = self._stream.choose(request.column, request.row)
         answer.accepted = not answer.reason
         return answer
 
     def on_restart(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        """End the track; the next image that shows a gap begins a new one."""
+        """End the track; the next image with a gap starts a new one."""
         self._stream.detector.restart()
-        answer.success, answer.message = True, "the next image that shows a gap begins a new track"
+        answer.success, answer.message = True, "the next image with a gap starts a new track"
         return answer
 
     def publish_picture(
@@ -168,7 +168,7 @@ class SegmentationNode(BaseNode):
         encoding: str,
         edges: GapEdges,
     ) -> None:
-        """Publish what was made of an image, with the header of its edges, which is the image's."""
+        """Publish a picture made from an image, with the header of its edges, which is the image's."""
         message = Image(
             header=edges.header, height=picture.shape[0], width=picture.shape[1], encoding=encoding
         )
@@ -183,7 +183,7 @@ class SegmentationNode(BaseNode):
         self._sequence = number
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """Status of the latest image, how often each status came, and why the last one was refused."""
+        """Status of the latest image, count of each status, and the reason of the last refusal."""
         latest = self._stream.latest
         well = latest is not None and latest.status is EdgeStatus.VALID
         counts: dict[str, object] = {**self._stream.counts, "images dropped": self._dropped}
@@ -193,7 +193,7 @@ class SegmentationNode(BaseNode):
 
 
 def unused_track_id() -> int:
-    """First number of this process's tracks: whoever hears them shall not take them for those of one before.
+    """First track number of this process, so that its tracks differ from those of an earlier process.
 
     A thousand for each second, from 1 to 4e9.
     """

@@ -1,4 +1,4 @@
-"""tracking_node: the tracked scope in, from a topic or Motive; scope_pose, the lens with its error, out."""
+"""tracking_node: poses of the tracked scope in, from topics or Motive; scope_pose, with its error, out."""
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,14 +28,14 @@ from knee_gap_perception.trackers.body_source import Subscription
 from knee_gap_perception.trackers.natnet.client import NatNetParameters
 from knee_gap_perception.trackers.scope_feed import ScopeFeed, SourceParameters
 
-# After so many diagnostics, one a second, a source that still gives nothing is told in the log as well.
+# Number of diagnostics, one per second, after which a source without data is reported in the log as well.
 DIAGNOSTICS_TO_LOG = 5
 # How long one look at a source that waits may take [s]: as long as the node may take to end.
 SOURCE_WAIT = 0.1
 
 
 class TrackingNode(BaseNode):
-    """Converts, calls the tracker, publishes; a pose that is refused is not published at all."""
+    """Converts, calls the tracker, publishes. A rejected pose is not published."""
 
     def __init__(self) -> None:
         super().__init__("tracking_node", health=self.health)
@@ -44,9 +44,9 @@ class TrackingNode(BaseNode):
         source, natnet = self.declare(SourceParameters), self.declare(NatNetParameters)
         self.refuse_unknown_parameters()
         self._accepted_before = 0
-        # Since the last diagnostics, and why the last of them was.
+        # Number of rejected poses since the last diagnostics, and the reason of the last one.
         self._refused, self._why_refused = 0, ""
-        # Diagnostics in a row without a sound source.
+        # Number of diagnostics in a row without a working source.
         self._silent = 0
         self._scope_pose = self.create_publisher(PoseWithCovarianceStamped, "scope_pose", RESULT_QOS)
         try:
@@ -67,7 +67,7 @@ class TrackingNode(BaseNode):
             medium=calibration.used_in,
         )
         self._calibration.publish(reported)
-        # Images and what Motive sends come in threads of their own.
+        # Images and Motive's frames arrive in threads of their own.
         self._one_at_a_time = threading.Lock()
         if calibration.scope_rotation_notch:
             self.create_subscription(ScopeNotch, "scope_notch", self.on_notch, RESULT_QOS)
@@ -80,7 +80,7 @@ class TrackingNode(BaseNode):
             self._receiver.start()
 
     def now_ns(self) -> int:
-        """Time of ROS, which NatNet's exposures are mapped to."""
+        """ROS time, to which NatNet's exposure times are mapped."""
         return int(self.get_clock().now().nanoseconds)
 
     def listen(self, subscription: Subscription) -> None:
@@ -97,7 +97,7 @@ class TrackingNode(BaseNode):
         )
 
     def on_message(self, put: Any, message: Any) -> None:
-        """Take a message into the source, and publish what it completes."""
+        """Pass a message to the source, and publish the poses of the frames that it completes."""
         put(message)
         self.publish_polled(0.0)
 
@@ -118,12 +118,12 @@ class TrackingNode(BaseNode):
                 self.publish_lenses(self._tracker.take(body, others))
 
     def on_notch(self, message: ScopeNotch) -> None:
-        """Take where the notch is in an image, and publish the pose of the lens at its stamp."""
+        """Receive the notch in an image, and publish the lens pose at its stamp."""
         with self._one_at_a_time:
             self.publish_lenses(self._tracker.take_notch(notch_from_message(message)))
 
     def recover(self, fault: Fault) -> None:
-        """Start the tracker afresh; the pose that raised is not published."""
+        """Reset the tracker; the pose that raised is not published."""
         with self._one_at_a_time:
             self._tracker.reset()
         self._refused, self._why_refused = self._refused + 1, fault.reason
@@ -137,10 +137,10 @@ class TrackingNode(BaseNode):
                 self._scope_pose.publish(fill_lens_pose(PoseWithCovarianceStamped(), lens))
             else:
                 self._refused, self._why_refused = self._refused + 1, lens.detail
-                self.log_once(lens.reason, f"pose refused: {lens.detail}")
+                self.log_once(lens.reason, f"pose rejected: {lens.detail}")
 
     def destroy_node(self) -> None:
-        """End the receiver before what it publishes with."""
+        """End the receiver before the publishers that it uses."""
         self._ended.set()
         if self._receiver is not None:
             self._receiver.join()
@@ -148,7 +148,7 @@ class TrackingNode(BaseNode):
         super().destroy_node()
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """How the source fares, how many poses were accepted since the last time, and what was refused."""
+        """Status of the source, and poses accepted and rejected since the last diagnostics."""
         accepted = self._tracker.accepted_count - self._accepted_before
         self._accepted_before = self._tracker.accepted_count
         source = self._feed.status()
@@ -162,7 +162,7 @@ class TrackingNode(BaseNode):
         if source.ok and not accepted and self._tracker.notch_flaw:
             words = self._tracker.notch_flaw
         elif source.ok and self._refused:
-            words += f", {self._refused} refused: {self._why_refused}"
+            words += f", {self._refused} rejected: {self._why_refused}"
         self._refused = 0
         counts: dict[str, object] = {
             "calibration": hash_or_none(self._tracker.calibration),

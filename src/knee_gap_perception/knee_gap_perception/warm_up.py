@@ -1,4 +1,4 @@
-"""Everything that finding and following the edges loads or compiles, before the first real image."""
+"""Warm-up of the edge tracking: loads and compiles all of its code before the first real image."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ FOCAL = 458.0
 
 
 def picture(shift: int) -> npt.NDArray[np.uint8]:
-    """Speckled tissue around a dark gap in a round field of view, moved sideways by `shift` [px]."""
+    """Image of speckled tissue around a dark gap in a round field of view, shifted by `shift` [px]."""
     rng = np.random.default_rng(1)
     speckle = cv2.GaussianBlur(rng.normal(0.0, 1.0, (HEIGHT, WIDTH)), (0, 0), 4.0)
     tissue = 150.0 + 25.0 * speckle / speckle.std()
@@ -27,7 +27,7 @@ def picture(shift: int) -> npt.NDArray[np.uint8]:
 
 
 def warm_up() -> EdgeStatus:
-    """Find a gap and follow its edges through a few pictures; status of the last, VALID if all was run."""
+    """Detect a gap and track its edges in a few images; return the last status, VALID if all code was run."""
     camera = FisheyeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (0.0, 0.0, 0.0, 0.0))
     detector = GapEdgeTracker()
     status = EdgeStatus.UNKNOWN

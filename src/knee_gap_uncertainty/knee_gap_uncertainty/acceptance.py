@@ -37,30 +37,30 @@ AGE_OF_A_RECORDING = 86_400.0
 class Reason(StrEnum):
     """Why an estimate is not VALID, in constant words: what is counted must be bounded."""
 
-    FAULT = "what was received made the estimator fail"
+    FAULT = "an input made the estimator fail"
     NOTHING_YET = "no edges received yet"
     SILENCE = "no edges arrive"
     NOT_SEEN = "the image gave no usable edges"
     HIDDEN = "a point is hidden in the image: its bearing is a prediction, not a measurement"
-    BAD_EDGES = "the edges carry numbers that cannot be"
+    BAD_EDGES = "the edges contain invalid numbers"
     FAR_FROM_CLOCK = "the image's stamp is far from this node's clock"
-    LATE = "the answer is too old when it leaves"
+    LATE = "the estimate is too late"
     NO_POSE_FOLLOWS = "no lens pose follows the image"
     NO_POSE = "no lens pose is near enough to the image's stamp"
     NO_TURN = RotationRefusal.NONE_NEAR.value
     CALIBRATION = "the calibrations of the nodes cannot be used"
     LEG_LOST = "the leg body is not tracked"
     UNKNOWN_MOTION = (
-        "the clock is uncertain, and no two lens poses near the image show how fast the lens moved"
+        "the clock is uncertain, and the lens's speed at the image is unknown: too few lens poses near it"
     )
     LEG_MOVED = "the leg body moved"
     CONTRADICTED = Finding.CONTRADICTION.value
     MOVED = Finding.MOVED.value
-    NO_NUMBERS = "the views, or the calibration's error, cannot be calculated with"
+    NO_NUMBERS = "the views or the calibration's error contain unusable numbers"
     NO_SECTION = "the edges of the opening at the section cannot be used"
-    AT_BORDER = "an edge of the opening lies beyond the border of the picture"
+    AT_BORDER = "an edge of the opening lies beyond the border of the field of view"
     HARDLY_MOVED = "the scope has hardly moved"
-    ALONG_THE_TRAVEL = "a point lies along the scope's travel"
+    ALONG_THE_TRAVEL = "a point lies in the direction of the scope's travel"
     RAYS_MEET_BEHIND = "the rays to a point do not meet in front of the scope"
     PARALLEL_RAYS = "the rays to a point are parallel"
     UNCHECKED = "two views cannot check each other"

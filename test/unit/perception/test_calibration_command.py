@@ -76,7 +76,7 @@ def test_steps_of_a_bag(bag: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["intrinsics", "BAG", "--into", "OUT"], "Say --board"),
+        (["intrinsics", "BAG", "--into", "OUT"], "Name it with --board"),
         (["intrinsics", "BAG", "--into", "OUT", "--board", "chess"], "a board is charuco"),
         (
             ["intrinsics", "BAG", "--into", "OUT", "--board", "dots:4x11:2", "--views", "6"],
@@ -94,7 +94,7 @@ def test_steps_of_a_bag(bag: Path) -> None:
         (["hand_eye", "BAG", "--into", "OUT", "--board", BOARD, "--begin", "5", "--end", "2"], "lie before"),
         (["pivot", "BAG", "--into", "OUT", "--begin", "1e300"], "lie before"),
         (["pivot", "BAG", "--into", "OUT", "--time-offset", "1e300"], "--time-offset must lie within 10 s"),
-        (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "a folder that may be written"),
+        (["time_offset", "BAG", "--into", "NOWHERE/scope.yaml"], "in a writable folder"),
         (["hand_eye", "NOWHERE", "--into", "OUT", "--board", BOARD], "does not exist"),
         (["show", "OUT"], "cannot be read"),
         (
@@ -181,9 +181,9 @@ def test_all_steps_are_those_that_bags_are_named_for(step_bags: tuple[Path, Path
         (["BOARD", "PIVOT"], "of several bags each is one step: name them board=BAG"),
         (["board=BOARD", "PIVOT"], "which step is it?"),
         (["board=BOARD", "board=PIVOT"], "two bags are named for the step board"),
-        (["pivot=PIVOT"], "no bag was named for the step 'board'; there are pivot"),
+        (["pivot=PIVOT"], "no bag is named for the step 'board'; there are pivot"),
         (["board=BOARD", "pivot=BAG"], "overlap in time"),
-        (["board=BOARD", "pivot=PIVOT", "--end", "3"], "several are given"),
+        (["board=BOARD", "pivot=PIVOT", "--end", "3"], "several bags are given"),
         (["board=NOWHERE"], "does not exist"),
         (["bored=BOARD"], "does not exist"),
     ],

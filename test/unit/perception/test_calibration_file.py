@@ -88,7 +88,7 @@ def test_a_file_changed_by_hand_is_refused(tmp_path: Path) -> None:
     ("text", "reason"),
     [
         ("a: [", "is not a YAML file"),
-        ("a: 1", "no calibration"),
+        ("a: 1", "is not a calibration"),
         ("format: knee_gap_calibration 1\nimage: 3", "malformed"),
         ("format: knee_gap_calibration 1\nhash: abc", "'image' is missing"),
     ],
@@ -192,7 +192,7 @@ def test_terms_of_the_lens_that_were_not_fitted_have_no_variance(tmp_path: Path)
     assert back is not None
     assert np.diagonal(back.covariance)[6:] == pytest.approx([0.0, 0.0])
     fixed[6, 0] = 1e-3
-    with pytest.raises(PerceptionError, match="relates an unknown that has no variance"):
+    with pytest.raises(PerceptionError, match="has a covariance with an unknown of no variance"):
         save_calibration(camera(covariance=fixed), tmp_path / "scope.yaml")
 
 
@@ -219,7 +219,7 @@ def test_no_place_for_a_calibration_is_told_before_the_work(tmp_path: Path) -> N
     (tmp_path / "link").symlink_to("nowhere")
     os.mkfifo(tmp_path / "fifo")
     for place in (tmp_path / "link", tmp_path / "fifo", tmp_path, tmp_path / "nowhere" / "scope.yaml"):
-        with pytest.raises(PerceptionError, match="must name a file in a folder that may be written"):
+        with pytest.raises(PerceptionError, match="name a file in a writable folder"):
             require_place(place)
     require_place(tmp_path / "new.yaml")
 

@@ -321,7 +321,7 @@ class TestRefusals:
     @pytest.mark.parametrize(("old", "new"), [("0,0.000000", "1e300,0"), ("0,0.000000", "0,1e300")])
     def test_numbers_beyond_any_take_are_refused(self, tmp_path, old, new):
         text = Export().text([[SEEN, SEEN]] * 2)
-        with pytest.raises(TakeError, match="no frame number and time"):
+        with pytest.raises(TakeError, match="are not a frame number and a time"):
             read_take(written(tmp_path, text.replace(old, new, 1)))
 
     def test_what_is_whole_of_a_cut_file_on_request(self, tmp_path):
@@ -348,7 +348,7 @@ class TestRefusals:
         self.check(tmp_path, text, "line 10: its time does not follow")
 
     def test_two_bodies_of_one_name(self, tmp_path):
-        self.check(tmp_path, Export(bodies=("scope", "scope")).text(ROWS), "two columns are called")
+        self.check(tmp_path, Export(bodies=("scope", "scope")).text(ROWS), "two columns are named")
 
     def test_without_header(self, tmp_path):
         rows = Export().text(ROWS).split("\r\n")

@@ -123,16 +123,16 @@ class TestHostilePackets:
             decode_packet(server.frame((4, 1), FULL), NatNetVersion(5, 0))
 
     def test_data_before_the_version_is_known(self):
-        with pytest.raises(PacketError, match="before the server told its version"):
+        with pytest.raises(PacketError, match="before the server's version"):
             decode_packet(server.frame((4, 1), FULL), None)
 
     def test_a_length_that_is_not_true(self):
-        with pytest.raises(PacketError, match="says 8 bytes follow, but 9 do"):
+        with pytest.raises(PacketError, match="announces 8 bytes, but contains 9"):
             decode_packet(struct.pack("<HH9x", 13, 8), None)
 
     def test_a_clock_that_stands_still(self):
         data = server.server_info((3, 0), frequency=0, data_port=1511, multicast_address=None)
-        with pytest.raises(PacketError, match="stands still"):
+        with pytest.raises(PacketError, match="clock frequency is 0 Hz"):
             decode_packet(data, None)
 
     def test_errors_are_of_the_package_s_family(self):

@@ -183,14 +183,14 @@ class TestStamps:
         world.run(1.0)
         frame = world.motive.frame(world.now + round(off * SECOND))
         assert world.session.receive(frame, MOTIVE, world.now + MILLISECOND) is None
-        assert world.session.counts["frames whose time cannot be"] == 1
+        assert world.session.counts["frames with an impossible time"] == 1
 
     def test_frames_without_an_answer_to_echoes_are_not_stamped_at_all(self):
         motive = Motive()
         motive.echoes = False
         world = World(motive)
         assert world.run(3.0) == []
-        assert "answers no echoes" in world.session.status(world.now).words
+        assert "but no echoes" in world.session.status(world.now).words
 
     def test_nothing_is_stamped_before_the_clock_is_known_to_a_millisecond(self):
         world = World(way=5 * MILLISECOND)
@@ -345,12 +345,12 @@ class TestForgedPackets:
         assert len(given) > 200
         assert names_and_places(given) == RIGHT
         counts = world.session.counts
-        reason = "that rename bodies in view" if wanted else "not asked for"
+        reason = "that rename bodies in view" if wanted else "without a request"
         assert counts[f"model definitions {reason}"] == 20
         if wanted:
             world.session._models_wanted = True
             Forger(world, MOTIVE[1]).models(names)
-            assert "which is in view, is not believed" in world.session.status(world.now).words
+            assert "which is in view, is ignored" in world.session.status(world.now).words
 
     def test_not_even_where_the_server_says_that_its_models_changed(self):
         world = World()

@@ -252,7 +252,7 @@ def test_a_turn_that_is_not_known_well_is_felt_in_the_covariance() -> None:
         (
             {},
             replace(SCOPE, oblique=Oblique(0.3, None, np.nan, np.nan, notch_shape=SHAPE)),
-            "axis that the scope turns about",
+            "no rotation axis of the scope",
         ),
     ],
 )

@@ -124,7 +124,7 @@ class TestRefusals:
         same = PoseSeries(
             "frozen", np.arange(count) / RATE, np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
         )
-        with pytest.raises(PerceptionError, match="do not vary at all"):
+        with pytest.raises(PerceptionError, match="all poses are equal"):
             tracker_precision(same)
 
 

@@ -95,7 +95,7 @@ def test_mistakes_are_one_line(simulated: Path, tmp_path: Path, capsys: pytest.C
         ([str(elsewhere)], "has the stamp"),
         ([str(simulated), "--every", "0"], "--every must"),
         ([str(simulated), "--image-topic", "/nowhere"], "/nowhere is not in"),
-        ([str(tmp_path)], "is not a bag or a folder"),
+        ([str(tmp_path)], "is not a bag"),
     ):
         assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
         lines = [line for line in capsys.readouterr().err.splitlines() if "evaluating" not in line]

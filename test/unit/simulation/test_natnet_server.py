@@ -214,7 +214,10 @@ def test_without_a_server_the_client_waits_and_says_why():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"server_address": "no.such.host.invalid"}, "server_address 'no.such.host.invalid' is no address"),
+        (
+            {"server_address": "no.such.host.invalid"},
+            "server_address 'no.such.host.invalid' cannot be resolved",
+        ),
         ({"local_address": "192.0.2.1"}, "no interface 192.0.2.1"),
         ({"transmission": "broadcast"}, "must be one of auto, unicast, multicast"),
         ({"command_port": 0}, r"command_port must lie in \[1, 65535\], not 0"),

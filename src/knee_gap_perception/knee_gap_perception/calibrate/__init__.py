@@ -1,1 +1,1 @@
-"""The command `calibrate`: from a recording to a calibration file."""
+"""The command `calibrate`: a calibration file from a recording."""

@@ -1,4 +1,4 @@
-"""What calibration reads of recorded bags, by the one reader of all commands; no ROS needed."""
+"""Input of a calibration from recorded bags: images, poses, camera_info and marked steps, without ROS."""
 
 import logging
 from collections.abc import Generator, Iterator, Mapping
@@ -31,15 +31,15 @@ POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovari
 
 @dataclass(frozen=True)
 class CalibrationBag:
-    """A recorded bag, and the part of it [s from its start] that is to be read.
+    """A recorded bag, and the part of it [s from its start] to be read.
 
-    Raises PerceptionError where there is no bag, or not one that can be read.
+    Raises PerceptionError if there is no bag or it cannot be read.
     """
 
     path: Path
     begin: float = 0.0
     end: float = float("inf")
-    # Opened once for all parts, so that damage is told once.
+    # Opened once for all parts, so that damage is reported once.
     _reader: BagReader | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -48,12 +48,12 @@ class CalibrationBag:
 
     @property
     def reader(self) -> BagReader:
-        """The bag itself."""
+        """The reader of the bag."""
         assert self._reader is not None
         return self._reader
 
     def steps(self) -> dict[str, tuple[float, float]]:
-        """Parts [s] that the step topic marks, by name; empty where nothing was marked."""
+        """Parts [s] that the step topic marks, by name; empty if none is marked."""
         if STEP_TOPIC not in self.reader.topics:
             return {}
         start_ns, marks = self._start_ns(), []
@@ -69,9 +69,9 @@ class CalibrationBag:
         }
 
     def part(self, name: str) -> "CalibrationBag":
-        """The part that a step marks, or the whole bag where no step is marked at all.
+        """The part marked as a step, or the whole bag if no step is marked.
 
-        Raises PerceptionError where others are marked, but not this one.
+        Raises PerceptionError if other steps are marked, but not this one.
         """
         steps = self.steps()
         if not steps:
@@ -84,7 +84,7 @@ class CalibrationBag:
     def images(self, topic: str) -> Generator[tuple[int, npt.NDArray[np.uint8]], None, None]:
         """Stamp [ns] and image (h, w, 3) of every image.
 
-        Raises PerceptionError for a topic that is not in the bag or carries no images.
+        Raises PerceptionError if the topic is not in the bag or does not contain images.
         """
         for stamp, message, msgtype in self._messages(topic, tuple(IMAGE_TYPES)):
             yield stamp, IMAGE_TYPES[msgtype](message)
@@ -97,19 +97,19 @@ class CalibrationBag:
         return next(self.reader.messages([topic]), None) is not None if count is None else count > 0
 
     def camera_info(self, topic: str) -> Any | None:
-        """The first sensor_msgs/CameraInfo on a topic; None where there is none."""
+        """The first sensor_msgs/CameraInfo on a topic; None if there is none."""
         if not self.has(topic):
             return None
         first = next(iter(self._messages(topic, ("sensor_msgs/msg/CameraInfo",))), None)
         return None if first is None else first[1]
 
     def image_stamps(self, topic: str) -> npt.NDArray[np.int64]:
-        """Stamps [ns] of every image, none decoded."""
+        """Stamps [ns] of all images, without decoding them."""
         stamps = [self.reader.stamp_ns(entry) for entry in self._entries(topic, tuple(IMAGE_TYPES))]
         return np.array([stamp for stamp in stamps if stamp is not None], dtype=np.int64)
 
     def poses(self, topic: str) -> tuple[npt.NDArray[np.int64], Array]:
-        """Stamps (n,) [ns] and poses (n, 4, 4); what is no pose (NaN, no unit quaternion) is left out."""
+        """Stamps (n,) [ns] and poses (n, 4, 4); invalid poses (NaN, no unit quaternion) are left out."""
         stamps, quaternions, positions = [], [], []
         for stamp, message, _ in self._messages(topic, POSE_TYPES):
             pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
@@ -124,7 +124,7 @@ class CalibrationBag:
         return np.array(stamps, dtype=np.int64), rigid(Rotation.from_quat(quaternions).as_matrix(), positions)
 
     def span_ns(self, topic: str) -> tuple[int, int] | None:
-        """First and last stamp [ns] on a topic; None where it has none."""
+        """First and last stamp [ns] on a topic; None if it has no messages."""
         entries = self._entries(topic, POSE_TYPES) if self.has(topic) else ()
         stamps = [stamp for entry in entries if (stamp := self.reader.stamp_ns(entry)) is not None]
         return (min(stamps), max(stamps)) if stamps else None
@@ -136,7 +136,7 @@ class CalibrationBag:
                 yield stamp_ns(message.header), message, entry.msgtype
 
     def _entries(self, topic: str, msgtypes: tuple[str, ...]) -> Iterator[BagMessage]:
-        """The part's messages on a topic. Raises PerceptionError where it is not of one of the types."""
+        """The part's messages on a topic. Raises PerceptionError if it is of none of the types."""
         _require_type(self.reader, topic, msgtypes)
         start_ns = self._start_ns()
         first_ns = start_ns + round(self.begin * 1e9)
@@ -148,12 +148,12 @@ class CalibrationBag:
                 yield entry
 
     def _start_ns(self) -> int:
-        """When the first message of the bag was recorded [ns]."""
+        """Recording time of the first message of the bag [ns]."""
         first = next(self.reader.messages(), None)
         return 0 if first is None else first.time_ns
 
     def _readable(self, entry: BagMessage) -> Any | None:
-        """A message; None, and one line in the log, where its bytes are none."""
+        """The message; None, and one line in the log, if it cannot be read."""
         try:
             return self.reader.deserialize(entry)
         except BagError as error:
@@ -162,27 +162,27 @@ class CalibrationBag:
 
 
 class CalibrationBags:
-    """The bags of one calibration: one for all steps, or one a step.
+    """The bags of one calibration: one for all steps, or one per step.
 
-    `bags` are the bags of named steps; the one without a name ("") has the steps that its marks say. A bag
-    without marks is any step that is asked of it. Raises PerceptionError for a bag that cannot be read.
+    `bags` are the bags by step; the bag without a name ("") has the steps that are marked in it. A bag
+    without marks serves for any step. Raises PerceptionError for a bag that cannot be read.
     """
 
     def __init__(self, bags: Mapping[str, Path], begin: float = 0.0, end: float = float("inf")) -> None:
         self._bags = {step: CalibrationBag(path, begin, end) for step, path in bags.items()}
 
     def steps(self) -> list[str]:
-        """Steps that there are parts for, as the bags are named or marked."""
+        """Steps for which there are parts, by names of bags or marks."""
         marked = list(self._bags[""].steps()) if "" in self._bags else []
         return [*(step for step in self._bags if step), *marked]
 
     def part(self, step: str) -> CalibrationBag:
-        """The part of a step. Raises PerceptionError where there is none."""
+        """The part of a step. Raises PerceptionError if there is none."""
         if step in self._bags:
             return self._bags[step].part(step)
         if "" in self._bags:
             return self._bags[""].part(step)
-        raise PerceptionError(f"no bag was named for the step '{step}'; there are {', '.join(self._bags)}")
+        raise PerceptionError(f"no bag is named for the step '{step}'; there are {', '.join(self._bags)}")
 
     def poses(self, topic: str) -> tuple[npt.NDArray[np.int64], Array]:
         """Stamps (n,) [ns] and poses (n, 4, 4) of all bags, one after the other."""
@@ -192,13 +192,13 @@ class CalibrationBags:
         return np.concatenate([stamps for stamps, _ in read]), np.concatenate([poses for _, poses in read])
 
     def require_apart(self, topic: str) -> None:
-        """Raise PerceptionError where poses of bags overlap in time: one's would be taken for the other's."""
+        """Raise PerceptionError if the poses of two bags overlap in time, which would mix them up."""
         bags = self._each() if len(self._bags) > 1 else []
         spans = sorted((*span, str(bag.path)) for bag in bags if (span := bag.span_ns(topic)))
         for (_, last, one), (first, _, other) in pairwise(spans):
             if first <= last:
                 raise PerceptionError(
-                    f"{one} and {other} overlap in time: the steps are recorded one after the other"
+                    f"{one} and {other} overlap in time: record the steps one after the other"
                 )
 
     def _each(self) -> list[CalibrationBag]:
@@ -207,7 +207,7 @@ class CalibrationBags:
 
 
 def opened(path: Path) -> BagReader:
-    """Reader of a bag, a folder or an MCAP file. Raises PerceptionError where it is none."""
+    """Reader of a bag, which is a folder or an MCAP file. Raises PerceptionError if it is not one."""
     try:
         return BagReader(path)
     except BagError as error:
@@ -217,10 +217,10 @@ def opened(path: Path) -> BagReader:
 
 
 def _require_type(reader: BagReader, topic: str, msgtypes: tuple[str, ...]) -> None:
-    """Raise PerceptionError for a topic that is not in the bag or has none of the types."""
+    """Raise PerceptionError if a topic is not in the bag or is of none of the types."""
     if (msgtype := reader.topics.get(topic)) in msgtypes:
         return
     if msgtype is not None:
-        raise PerceptionError(f"{topic} carries {msgtype}, not {' or '.join(msgtypes)}")
+        raise PerceptionError(f"{topic} is of type {msgtype}, not {' or '.join(msgtypes)}")
     others = ", ".join(sorted(name for name, kind in reader.topics.items() if kind in msgtypes)) or "none"
     raise PerceptionError(f"{topic} is not in {reader.path}; topics of that kind: {others}")

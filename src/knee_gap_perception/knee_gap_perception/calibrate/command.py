@@ -1,4 +1,4 @@
-"""`calibrate`: a scope's calibration from recorded bags into one file, step by step or all at once."""
+"""The command `calibrate`: calibration of a scope from recorded bags, step by step or all at once."""
 
 import argparse
 import logging
@@ -25,12 +25,12 @@ from knee_gap_perception.scope_rotation.shaft_axis import Mount
 STEPS = {
     "intrinsics": "focal lengths, principal point and distortion, from a board",
     "time_offset": "time between video and tracker, from any textured scene",
-    "hand_eye": "the lens on the tracked body, from a board that stands still",
-    "oblique": "hand_eye, and the axis about which an oblique scope turns, from its notch or a second body",
-    "pivot": "the scope's tip on the tracked body, from pivoting about it",
-    "all": "every step that the bags have data for",
+    "hand_eye": "pose of the lens on the tracked body, from a stationary board",
+    "oblique": "hand_eye, and the rotation axis of an oblique scope, from its notch or a second body",
+    "pivot": "position of the scope's tip on the tracked body, from pivoting about it",
+    "all": "all steps for which the bags have data",
 }
-# What a recording is of; each may be a bag of its own.
+# Parts of a recording; each may be a bag of its own.
 PARTS = ("board", "oblique", "pivot")
 
 
@@ -44,41 +44,41 @@ def _parser() -> Parser:
             "bags",
             nargs="+",
             metavar="BAG",
-            help=f"recorded bag, folder or .mcap; or a bag a step, as STEP=BAG: {', '.join(PARTS)}",
+            help=f"recorded bag, folder or .mcap; or one bag per step as STEP=BAG: {', '.join(PARTS)}",
         )
         step.add_argument(
-            "--into", type=Path, required=True, metavar="FILE", help="calibration to make or add to"
+            "--into", type=Path, required=True, metavar="FILE", help="calibration file to create or extend"
         )
         step.add_argument("--board", metavar="BOARD", help=BOARD_SYNTAX)
         step.add_argument("--image-topic", default=defaults.image_topic)
         step.add_argument("--pose-topic", default=defaults.pose_topic)
         step.add_argument(
-            "--scope-pose-topic", help="second tracked body, on the scope: instead of the notch"
+            "--scope-pose-topic", help="second tracked body, on the scope, used instead of the notch"
         )
         step.add_argument("--model", choices=list(NAMES), default=defaults.model.distortion_model)
         step.add_argument("--high-order", action="store_true", help="fit the high distortion terms too")
         step.add_argument("--mount", choices=[str(m) for m in Mount], default=str(defaults.mount))
-        step.add_argument("--views", type=int, default=defaults.views, help="images to look for the board in")
+        step.add_argument("--views", type=int, default=defaults.views, help="images to search for the board")
         step.add_argument(
             "--medium",
             metavar="MEDIUM",
-            help=f"what the board lies in: {CHOICES} (FILE's; a new one's: air); best what it is used in",
+            help=f"medium around the board: {CHOICES} (as in FILE; new: air); best the medium of use",
         )
-        step.add_argument("--fixed-intrinsics", action="store_true", help="keep the camera as it is in FILE")
-        step.add_argument("--time-offset", type=finite, metavar="S", help="to start from, instead of FILE's")
+        step.add_argument("--fixed-intrinsics", action="store_true", help="keep the camera of FILE")
+        step.add_argument("--time-offset", type=finite, metavar="S", help="initial value, instead of FILE's")
         step.add_argument("--max-offset", type=finite, default=defaults.max_offset, metavar="S")
         step.add_argument(
             "--begin", type=finite, default=0.0, metavar="S", help="part of the bag, from its start"
         )
         step.add_argument("--end", type=float, default=float("inf"), metavar="S")
-    show = steps.add_parser("show", help="what a calibration says, and its hash")
+    show = steps.add_parser("show", help="print a calibration and its hash")
     show.add_argument("file", type=Path)
-    show.add_argument("--parameters", action="store_true", help="as parameters of tracking_node, to paste")
+    show.add_argument("--parameters", action="store_true", help="print it as parameters of tracking_node")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Calibrate; 0 when it is done."""
+    """Calibrate; return 0 if it succeeded."""
     arguments = _parser().parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="calibrate: %(message)s", stream=sys.stderr)
     try:
@@ -128,20 +128,20 @@ def _calibrate(arguments: argparse.Namespace) -> None:
 
 
 def _medium(given: Medium | None, calibration: Calibration | None, path: Path) -> Medium:
-    """What the board lies in: as given, or as in the file. Raises PerceptionError where they differ."""
+    """Medium around the board, as given or as in the file. Raises PerceptionError if they differ."""
     if calibration is None or given is None:
         return given or (calibration.medium if calibration is not None else AIR)
     seen = calibration.camera is not None or calibration.lens is not None
     if seen and given != calibration.medium:
         raise PerceptionError(
-            f"{path} was calibrated in {calibration.medium.value}, not in {given.value}: take all steps in "
+            f"{path} was calibrated in {calibration.medium.value}, not in {given.value}: record all steps in "
             "one medium, or name a new file"
         )
     return given
 
 
 def _bags(arguments: argparse.Namespace) -> dict[str, Path]:
-    """Bags by the step that each was named for, "" for the one that holds all. Raises PerceptionError."""
+    """Bags by the step that each is named for, "" for a bag with all steps. Raises PerceptionError."""
     named: dict[str, Path] = {}
     for text in arguments.bags:
         step, equals, path = text.partition("=")
@@ -153,14 +153,14 @@ def _bags(arguments: argparse.Namespace) -> dict[str, Path]:
             raise PerceptionError(f"{twice}: name them {wanted}")
         named[step] = Path(path)
     if "" in named and len(named) > 1:
-        raise PerceptionError(f"{named['']}: which step is it? Of several bags each is named, as board=BAG")
+        raise PerceptionError(f"{named['']}: which step is it? Name each of several bags, as in board=BAG")
     if len(named) > 1 and (arguments.begin > 0.0 or arguments.end < float("inf")):
-        raise PerceptionError("--begin and --end are a part of one bag, and several are given")
+        raise PerceptionError("--begin and --end select a part of one bag, but several bags are given")
     return named
 
 
 def chosen_steps(step: str, recording: Recording) -> list[str]:
-    """The steps to take: one, or all that the bags have; in an unmarked bag, those of a board."""
+    """Steps to run: one, or all that the bags have; for a bag without marks, those with a board."""
     if step != "all":
         return [step]
     marked = recording.steps
@@ -169,7 +169,7 @@ def chosen_steps(step: str, recording: Recording) -> list[str]:
 
 
 def _progress(items: Iterable[int], text: str) -> Iterable[int]:
-    """A bar on a terminal; a line at each quarter elsewhere."""
+    """Show a progress bar on a terminal, else one line per quarter."""
     known = list(items)
     if sys.stderr.isatty():
         yield from tqdm(known, desc=text, unit="image", leave=False)
@@ -206,7 +206,7 @@ def _show(calibration: Calibration) -> None:
             f"{np.degrees(sigma[1]):.3f} deg"
         )
     if (oblique := calibration.oblique) is not None:
-        turning = "may be turned" if oblique.axis is not None else "must not be turned"
+        turning = "may be rotated" if oblique.axis is not None else "must not be rotated"
         print(f"notch at {np.degrees(oblique.notch_angle):.2f} deg; the scope {turning} in its camera head")
     if (tip := calibration.tip) is not None:
         print("tip at " + " ".join(f"{1e3 * value:.3f}" for value in tip.position) + " mm on the body")

@@ -1,4 +1,4 @@
-"""Views of the board from a recorded bag: the stillest images, evenly over time, with the notch if seen."""
+"""Views of the board from a recorded bag: the stillest images, evenly over time, with the notch."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -15,23 +15,23 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.image.field_of_view import FieldOfViewFinder
 from knee_gap_perception.scope_rotation.notch import Notch, find_notch
 
-LEVER = 0.2  # [m] from body to lens: what turns a body's rotation into motion of the lens
+LEVER = 0.2  # [m] from body to lens: converts a body's rotation to motion of the lens
 
 
 class Observation(NamedTuple):
-    """A view of the board, and the notch, None where it was not found."""
+    """A view of the board, and the notch, None if it was not found."""
 
     board: BoardView
     notch: Notch | None
 
     @property
     def notch_angle(self) -> float:
-        """Angle of the notch [rad], NaN where it was not found."""
+        """Angle of the notch [rad], NaN if it was not found."""
         return self.notch.angle if self.notch else float("nan")
 
 
 class Observations(NamedTuple):
-    """The views in which the board was found, the size of all images, and how many were looked at."""
+    """The views in which the board was found, the size of all images, and the number of images searched."""
 
     views: tuple[Observation, ...]
     width_px: int
@@ -42,7 +42,7 @@ class Observations(NamedTuple):
 def still_stamps(
     stamps_ns: npt.NDArray[np.int64], count: int, track: PoseTrack | None, time_offset: float
 ) -> npt.NDArray[np.int64]:
-    """At most `count` stamps, evenly over time; of each stretch the one at which the lens moves least."""
+    """At most `count` stamps, evenly over time: in each interval the one at which the lens moves least."""
     stretches = np.array_split(stamps_ns, min(count, len(stamps_ns)))
     if track is None:
         return np.array([stretch[len(stretch) // 2] for stretch in stretches])
@@ -64,14 +64,14 @@ def observe(
     stamps_ns: npt.NDArray[np.int64],
     progress: Callable[[Iterable[int], str], Iterable[int]],
 ) -> Observations:
-    """Look for the board and the notch in the images with the given stamps.
+    """Find the board and the notch in the images with the given stamps.
 
-    Raises PerceptionError where the images change their size, or none of them is in the bag.
+    Raises PerceptionError if the images change their size, or if none of them is in the bag.
     """
     wanted, finder = set(stamps_ns.tolist()), FieldOfViewFinder()
     views, size, count = [], None, 0
     images = bag.images(topic)
-    for _ in progress(range(len(wanted)), "looking for the board"):
+    for _ in progress(range(len(wanted)), "searching the board"):
         stamp, image = next(((s, i) for s, i in images if s in wanted), (None, None))
         if stamp is None or image is None:
             break
@@ -94,7 +94,7 @@ def observe(
 def tracked_views(
     views: Sequence[BoardView], turns: Array, turn_sigmas: Array, track: PoseTrack, time_offset: float
 ) -> list[TrackedView]:
-    """Views with the body's pose at their exposure; those without a pose or a turn are left out."""
+    """Views with the body's pose at their exposure; those without a pose or a rotation are left out."""
     stamps = np.array([view.stamp_ns for view in views], dtype=np.int64) + round(time_offset * 1e9)
     good = track.covers(stamps) & np.isfinite(turns)
     poses, rates = track.at(stamps), track.twist_rates(stamps)

@@ -1,4 +1,4 @@
-"""The steps of a calibration: each from a recorded bag to its part of the calibration, told in words."""
+"""Steps of a calibration: each estimates one part of the calibration from a recorded bag and reports it."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -22,15 +22,15 @@ from knee_gap_perception.camera.projection import LensModel
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_rotation.notch import NOTCH_SIGMA, common_shape
 
-BODY_SIGMA = np.radians(0.02)  # of a turn that two tracked bodies tell
-MAX_PASSES = 5  # of hand-eye, for a better time and without views that do not fit
-DISAGREEMENT = 4.0  # standard errors between two estimates of the clock, from which they are called different
+BODY_SIGMA = np.radians(0.02)  # standard error of a rotation from two tracked bodies
+MAX_PASSES = 5  # of hand-eye, each with a better time offset and without outlying views
+DISAGREEMENT = 4.0  # standard errors between two estimates of the clock, above which a warning is given
 
 Report = Callable[[str], None]
 
 
 class Procedure:
-    """Calibration steps over one bag; what one step read serves the next."""
+    """Calibration steps on one recording; data read by one step are used by the next."""
 
     def __init__(self, recording: Recording, report: Report) -> None:
         self._recording, self._request, self._report = recording, recording.request, report
@@ -67,14 +67,14 @@ class Procedure:
         found = estimate_time_offset(image_motion(images()), track, max_offset=self._request.max_offset)
         self._report(
             f"the tracker's clock reads stamp {1e3 * found.offset:+.2f} ± {1e3 * found.sigma:.2f} ms "
-            f"({100 * found.explained:.1f} % of the picture's motion explained, {found.window_count} windows)"
+            f"({100 * found.explained:.1f} % of the image motion explained, {found.window_count} windows)"
         )
         clock = Clock(found.offset, found.sigma, "image motion")
         base = calibration or Calibration(*size[0])
         return base.with_parts(*size[0], clock=clock)
 
     def hand_eye(self, calibration: Calibration | None) -> Calibration:
-        """Lens on the tracked body, the scope not turned in its camera head."""
+        """Lens on the tracked body, without rotation of the scope in its camera head."""
         seen = self._recording.observe("board", calibration)
         angles = np.array([view.notch_angle for view in seen.views])
         reference = common_angle(angles, FIXED_TURN)
@@ -82,23 +82,22 @@ class Procedure:
         turned = int((away[np.isfinite(away)] > FIXED_TURN).sum())
         if turned > 0.2 * len(angles):
             raise PerceptionError(
-                f"the notch says that the scope is turned in its camera head in {turned} of {len(angles)} "
-                "views: hold it "
-                "fixed, or use calibrate oblique"
+                f"by the notch, the scope is rotated in its camera head in {turned} of {len(angles)} views: "
+                "hold it fixed, or use calibrate oblique"
             )
         known = self._with_camera(calibration)
         found = self._lens(known, [seen], [np.zeros(len(seen.views))], self._recording.offset(known))
         oblique = None
         if np.isfinite(reference):
             self._report(
-                f"notch at {np.degrees(reference):.2f} deg; until calibrate oblique, do not turn the scope"
+                f"notch at {np.degrees(reference):.2f} deg; do not rotate the scope before calibrate oblique"
             )
             shape = common_shape([view.notch for view in seen.views])
             oblique = Oblique(reference, None, float("nan"), float("nan"), notch_shape=shape)
         return _kept(known, seen, **self._parts(known, found), oblique=oblique)
 
     def oblique(self, calibration: Calibration | None) -> Calibration:
-        """Lens on the tracked body and the axis about which an oblique scope turns in its camera head."""
+        """Lens on the tracked body, and the rotation axis of an oblique scope in its camera head."""
         marked = [name for name in ("board", "oblique") if name in self._recording.steps]
         parts = [self._recording.observe(name, calibration) for name in marked or ["oblique"]]
         angles = np.concatenate([[view.notch_angle for view in seen.views] for seen in parts])
@@ -108,7 +107,7 @@ class Procedure:
         if self._request.scope_pose_topic is None:
             turns = turns_by_notch(parts)
         else:
-            # What a body's turn is at an image depends on the clock, which the same fit makes better.
+            # The rotation by a body at an image depends on the clock, which the same fit improves.
             for _ in range(MAX_PASSES):
                 turns, T_head_scope = turns_by_body(self._recording, parts, known.require_camera(), offset)
                 better = self._hand_eye(known, parts, turns, offset)[0].time_offset
@@ -117,7 +116,7 @@ class Procedure:
                 offset = better
         together = np.concatenate(turns)
         self._report(
-            f"turn known in {np.isfinite(together).sum()} of {len(together)} views, "
+            f"rotation known in {np.isfinite(together).sum()} of {len(together)} views, "
             f"{np.degrees(np.nanmin(together)):+.1f} to {np.degrees(np.nanmax(together)):+.1f} deg; notch at "
             f"{np.degrees(notch):.2f} deg"
         )
@@ -136,9 +135,7 @@ class Procedure:
     def pivot(self, calibration: Calibration | None) -> Calibration:
         """Tip of the scope on the tracked body."""
         if calibration is None:
-            raise PerceptionError(
-                "the tip is added to a calibration of the camera: run calibrate intrinsics first"
-            )
+            raise PerceptionError("the tip needs a calibration of the camera: run calibrate intrinsics first")
         found = calibrate_pivot(self._recording.raw_poses("pivot"))
         sigma = np.sqrt(np.diag(found.covariance))
         self._report(
@@ -154,17 +151,16 @@ class Procedure:
         views = [view.board for view in seen.views]
         if not views:
             raise PerceptionError(
-                f"the board was found in none of {seen.image_count} images: check --board, light, focus, "
-                "and that much of "
-                "the board is in the picture"
+                f"the board was found in none of {seen.image_count} images: check --board, light and focus, "
+                "and keep most of the board in the image"
             )
         return fit_intrinsics(views, seen.width_px, seen.height_px, self._request.model)
 
     def _with_camera(self, calibration: Calibration | None) -> Calibration:
-        """The calibration, with a camera from this bag where it has none."""
+        """The calibration, with a camera from this bag if it has none."""
         if isinstance(self._request.board, DotGrid) and not self._request.board.has_orientation:
             raise PerceptionError(
-                "a symmetric dot grid looks the same when turned by half a turn: use asymmetric dots or "
+                "a symmetric dot grid looks the same if rotated by half a turn: use asymmetric dots or "
                 "ChArUco"
             )
         if calibration is None or calibration.camera is None:
@@ -174,20 +170,20 @@ class Procedure:
     def _lens(
         self, known: Calibration, parts: list[Observations], turns: list[Array], offset: float
     ) -> HandEye:
-        """Hand-eye over parts, each view at its turn, told in words."""
+        """Hand-eye over parts, each view at its rotation, with a report."""
         found, count, offered = self._hand_eye(known, parts, turns, offset)
         if count < offered:
-            self._report(f"{offered - count} of {offered} views left out: the others do not explain them")
+            self._report(f"{offered - count} of {offered} views left out: not consistent with the others")
         self._tell(found, count)
         return found
 
     def _hand_eye(
         self, known: Calibration, parts: list[Observations], turns: list[Array], offset: float
     ) -> tuple[HandEye, int, int]:
-        """Hand-eye at the best time offset, without views that do not fit; how many it used, and had."""
+        """Hand-eye at the best time offset, without outlying views; numbers of views used and given."""
         request, camera = self._request, known.require_camera()
         model = LensModel(camera.distortion_model, request.model.high_order)
-        # Outliers among the points are told by the lens alone, before the tracker can be blamed for them.
+        # Outlying points are found with the lens alone, before they can be attributed to the tracker.
         board_views = [view.board for seen in parts for view in seen.views]
         fit = fit_intrinsics(board_views, parts[0].width_px, parts[0].height_px, model)
         stamps = [view.stamp_ns for view in board_views]
@@ -206,7 +202,7 @@ class Procedure:
             offset += found.time_offset
             bad = {view.board.stamp_ns for view, out in zip(views, found.outlying, strict=True) if out}
             keep &= np.array([view.stamp_ns not in bad for view in fit.views])
-            # Poses are read again at the better time, until what is left is too short to matter.
+            # Poses are evaluated again at the better time, until the change is negligible.
             if abs(found.time_offset) < 5e-4 and not bad:
                 break
         return replace(found, time_offset=offset), len(views), len(fit.views)
@@ -248,14 +244,14 @@ class Procedure:
         return parts
 
     def _clock(self, motion: Clock | None, board: Clock) -> Clock:
-        """The surer of two estimates of the clock; that they disagree is said."""
+        """The more accurate of two estimates of the clock, with a warning if they disagree."""
         self._report(f"time offset from the board {1e3 * board.offset:+.2f} ± {1e3 * board.sigma:.2f} ms")
         if motion is None or motion.source == board.source:
             return board
         apart = abs(motion.offset - board.offset) / np.hypot(motion.sigma, board.sigma)
         if apart > DISAGREEMENT:
             self._report(
-                f"warning: image motion says {1e3 * motion.offset:+.2f} ± {1e3 * motion.sigma:.2f} ms, "
+                f"warning: image motion gives {1e3 * motion.offset:+.2f} ± {1e3 * motion.sigma:.2f} ms, "
                 f"{apart:.1f} "
                 "standard errors away: are the stamps regular?"
             )

@@ -1,4 +1,4 @@
-"""A recorded bag as calibration reads it: what is asked of it, its poses, and its views of the board."""
+"""The recording of a calibration: its request, its poses, and its views of the board."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 
 @dataclass(frozen=True)
 class Request:
-    """What is calibrated from where: one bag under the name "", or one a step under the step's."""
+    """Request of a calibration: one bag under the name "", or one per step under the step's name."""
 
     bags: Mapping[str, Path]
     board: Board | None = None
@@ -56,7 +56,7 @@ class Request:
 
 
 class Recording:
-    """Bags and what was read of them, once, for whichever steps need it."""
+    """Bags and the data read from them, once for all steps."""
 
     def __init__(self, request: Request, progress: Progress) -> None:
         self.request = request
@@ -68,19 +68,19 @@ class Recording:
 
     @property
     def steps(self) -> list[str]:
-        """Steps that the bags are named for or mark."""
+        """Steps by the bags' names or marks."""
         return self._bags.steps()
 
     def images(self, part: str) -> Iterator[tuple[int, npt.NDArray[np.uint8]]]:
-        """Stamp [ns] and image of every image of a part, with progress told."""
+        """Stamp [ns] and image of every image of a part, with progress."""
         bag = self._bags.part(part)
         total = len(bag.image_stamps(self.request.image_topic))
-        steps = self._progress(range(total), "following the picture")
+        steps = self._progress(range(total), "measuring the image motion")
         for _, pair in zip(steps, bag.images(self.request.image_topic), strict=False):
             yield pair
 
     def raw_poses(self, part: str) -> Array:
-        """Poses (n, 4, 4) of the body in a part, as they were recorded."""
+        """Poses (n, 4, 4) of the body in a part, as recorded."""
         return self._bags.part(part).poses(self.request.pose_topic)[1]
 
     def second_track(self, topic: str) -> PoseTrack:
@@ -96,12 +96,12 @@ class Recording:
     def observe(self, part: str, calibration: Calibration | None) -> Observations:
         """Views of the board in a part.
 
-        Raises PerceptionError where no board is named, no image is tracked, or the calibration is for images
-        of another size.
+        Raises PerceptionError if no board is named, if the body is not tracked at any image, or if the
+        calibration is for images of another size.
         """
         request = self.request
         if request.board is None:
-            raise PerceptionError("which board is in the picture? Say --board")
+            raise PerceptionError("which board is in the images? Name it with --board")
         if part not in self._seen:
             bag = self._bags.part(part)
             try:
@@ -123,7 +123,7 @@ class Recording:
         return seen
 
     def offset(self, calibration: Calibration | None) -> float:
-        """Time offset to start from: asked for, calibrated before, or none."""
+        """Initial time offset: given, calibrated before, or 0."""
         if self.request.time_offset is not None:
             return self.request.time_offset
         return calibration.clock.offset if calibration and calibration.clock else 0.0

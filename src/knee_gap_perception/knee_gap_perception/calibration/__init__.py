@@ -1,1 +1,1 @@
-"""Calibration of a tracked scope: lens, body-to-lens, tip, turn of the oblique scope, clock of the video."""
+"""Calibration of a tracked scope, as used at run time: camera, lens on the body, rotation, tip, clock."""

@@ -19,11 +19,11 @@ from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis, rota
 
 @dataclass(frozen=True)
 class LensOnBody:
-    """The lens on the tracked body, as `hand_eye` finds it.
+    """The pose of the lens on the tracked body, estimated by `hand_eye`.
 
-    `covariance` (6, 6) is of the twist (rotation [rad], translation [m]) of `T_body_lens` in the lens frame;
-    all views share this error. `rotation_error` [rad] and `translation_error` [m] are RMS errors of the
-    tracked body.
+    `covariance` (6, 6) is that of the twist (rotation [rad], translation [m]) of `T_body_lens` in the lens
+    frame; all views share this error. `rotation_error` [rad] and `translation_error` [m] are RMS errors of
+    the tracked body.
     """
 
     translation: Array
@@ -37,17 +37,17 @@ class LensOnBody:
 
     @property
     def T_body_lens(self) -> Array:  # noqa: N802 - frames are in the name
-        """The lens on the body (4, 4), at the calibrated turn of the scope."""
+        """The lens on the body (4, 4), at the calibrated rotation of the scope."""
         return rigid(Rotation.from_quat(self.quaternion_xyzw).as_matrix(), self.translation)
 
 
 @dataclass(frozen=True)
 class Oblique:
-    """What tells the turn of the scope in its camera head: the shaft's axis, and where it was calibrated.
+    """Reference of the scope's rotation in its camera head: the shaft's axis and the calibrated rotation.
 
-    `notch_angle` [rad] is where the notch stood, NaN where it was not seen; `T_head_scope` (4, 4) where a
-    second tracked body on the scope stood against the one on the camera head, None without one; `notch_shape`
-    what the notch looks like, None where it was not seen or the file is of before it was kept.
+    `notch_angle` [rad] is the direction of the notch, NaN if it was not detected. `T_head_scope` (4, 4) is
+    the pose of a second tracked body on the scope relative to the one on the camera head, None without one.
+    `notch_shape` is the shape of the notch, None if it was not detected or if an older file does not have it.
     """
 
     notch_angle: float
@@ -69,7 +69,7 @@ class Tip:
 
 @dataclass(frozen=True)
 class Clock:
-    """What to add to an image's stamp for the tracker's clock [s], its standard error, and what found it."""
+    """Time offset from an image's stamp to the tracker's clock [s], its standard error, and its source."""
 
     offset: float
     sigma: float
@@ -78,9 +78,9 @@ class Clock:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All that was calibrated of one scope, for images of one size. What was not is None.
+    """The calibration of one scope, for images of one size. Parts that were not calibrated are None.
 
-    `medium` is what the board lay in.
+    `medium` is the medium around the board.
     """
 
     width_px: int
@@ -107,35 +107,33 @@ class Calibration:
             )
 
     def require_camera(self) -> Intrinsics:
-        """The intrinsics. Raises PerceptionError where they were not calibrated."""
+        """The intrinsics. Raises PerceptionError if they were not calibrated."""
         if self.camera is None:
             raise PerceptionError("the calibration has no camera: run calibrate intrinsics")
         return self.camera
 
     def require_lens(self) -> LensOnBody:
-        """The lens on the body. Raises PerceptionError where it was not calibrated."""
+        """The lens on the body. Raises PerceptionError if it was not calibrated."""
         if self.lens is None:
-            raise PerceptionError("the calibration does not say where the lens is: run calibrate hand_eye")
+            raise PerceptionError("the calibration has no pose of the lens: run calibrate hand_eye")
         return self.lens
 
     def require_notch(self) -> NotchShape:
-        """What the notch looks like, where all is known that its angle tells the lens by.
+        """The shape of the notch, if all values are known that are needed to use its angle.
 
-        Raises PerceptionError where something is not.
+        Raises PerceptionError if one is not.
         """
         oblique = self.oblique
         if oblique is None or oblique.notch_shape is None or not np.isfinite(oblique.notch_angle):
             raise PerceptionError("the calibration does not know the notch: run calibrate oblique")
         if oblique.axis is None and self.require_lens().mount is Mount.CAMERA_HEAD:
-            raise PerceptionError(
-                "the calibration does not know the axis that the scope turns about: run calibrate oblique"
-            )
+            raise PerceptionError("the calibration has no rotation axis of the scope: run calibrate oblique")
         return oblique.notch_shape
 
     def body_to_lens(self, scope_rotation: float = 0.0) -> Array:
-        """`T_body_lens` (4, 4) at a turn [rad] of the scope in its camera head since the calibration.
+        """`T_body_lens` (4, 4) at a rotation [rad] of the scope in its camera head since the calibration.
 
-        Raises PerceptionError where the lens, or for a turned scope its axis, was not calibrated.
+        Raises PerceptionError if the lens, or for a rotated scope its axis, was not calibrated.
         """
         lens = self.require_lens()
         return rotated_lens(
@@ -143,9 +141,9 @@ class Calibration:
         )
 
     def motion_by_rotation(self, T_body_lens: Array) -> Array:
-        """How the lens at (4, 4) on the body moves with the turn of the scope, in the frame of the body.
+        """Derivative (6,) of the lens pose (4, 4) on the body by the scope's rotation, in the body frame.
 
-        (6,): position [m/rad], rotation [-]. Raises PerceptionError where the lens was not calibrated.
+        Position [m/rad], rotation [-]. Raises PerceptionError if the lens was not calibrated.
         """
         position, rotation = np.zeros(3), -T_body_lens[:3, 2]
         axis = self.oblique.axis if self.oblique else None
@@ -155,9 +153,9 @@ class Calibration:
         return np.concatenate([position, rotation])
 
     def tracking_parameters(self) -> dict[str, list[float] | float]:
-        """What of this goes into `tracking_node`'s parameters, by their names.
+        """Parameters of `tracking_node` from this calibration, by name.
 
-        Raises PerceptionError where the lens was not calibrated.
+        Raises PerceptionError if the lens was not calibrated.
         """
         lens = self.require_lens()
         return {
@@ -167,9 +165,9 @@ class Calibration:
         }
 
     def scope_rotation(self, notch_angle: float) -> float:
-        """Turn [rad], in (-pi, pi], that a notch seen at an angle [rad] says.
+        """Rotation [rad], in (-pi, pi], for a notch at an angle [rad].
 
-        Raises PerceptionError where the notch was not calibrated.
+        Raises PerceptionError if the notch was not calibrated.
         """
         if self.oblique is None or not np.isfinite(self.oblique.notch_angle):
             raise PerceptionError("the calibration does not know the notch: run calibrate oblique")
@@ -177,13 +175,13 @@ class Calibration:
         return float(turn)
 
     def scope_rotation_of_body(self, T_head_scope: Array) -> float:
-        """Turn [rad] that a second body on the scope says, from its pose (4, 4) in the frame of the first.
+        """Rotation [rad] by a second body on the scope, from its pose (4, 4) in the frame of the first.
 
-        Raises PerceptionError where the second body was not calibrated.
+        Raises PerceptionError if the second body was not calibrated.
         """
         if self.oblique is None or self.oblique.T_head_scope is None or self.oblique.axis is None:
             raise PerceptionError(
-                "the calibration knows no second body on the scope: run calibrate oblique --scope-pose-topic"
+                "the calibration has no second body on the scope: run calibrate oblique --scope-pose-topic"
             )
         return rotation_between(self.oblique.T_head_scope, T_head_scope, self.oblique.axis.direction)
 
@@ -194,13 +192,13 @@ class Calibration:
 
 
 def content_of(calibration: Calibration) -> dict[str, Any]:
-    """Content of a calibration as its file has it, which its hash is taken of."""
+    """Content of a calibration file, which its hash is computed from."""
     camera, lens, oblique = calibration.camera, calibration.lens, calibration.oblique
     tip, clock = calibration.tip, calibration.clock
     content: dict[str, Any] = {
         "image": {"width_px": calibration.width_px, "height_px": calibration.height_px}
     }
-    # Left out in air, which older files do not name: they keep their hash.
+    # Left out for air, so that older files, which do not have it, keep their hash.
     if calibration.medium != AIR:
         content["medium"] = calibration.medium.value
     if camera is not None:
@@ -233,10 +231,10 @@ def content_of(calibration: Calibration) -> dict[str, Any]:
             "axis_point": _numbers(oblique.axis.point) if oblique.axis else None,
             "axis_tilt_sigma": oblique.axis_tilt_sigma,
             "axis_shift_sigma": oblique.axis_shift_sigma,
-            # Rounding a rotation matrix to a quaternion and back would change the hash.
+            # Conversion of a rotation matrix to a quaternion and back would change the hash by rounding.
             "T_head_scope": _numbers(oblique.T_head_scope) if oblique.T_head_scope is not None else None,
         }
-        # Left out where it is not known, so that older files keep their hash.
+        # Left out if it is unknown, so that older files keep their hash.
         if oblique.notch_shape is not None:
             content["oblique"]["notch_depth"] = oblique.notch_shape.depth
             content["oblique"]["notch_width"] = oblique.notch_shape.width

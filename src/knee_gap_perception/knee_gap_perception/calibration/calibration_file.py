@@ -1,4 +1,4 @@
-"""The calibration of one scope as one YAML file, with a hash by which results can say what they rest on."""
+"""Calibration file of one scope (YAML), with a hash that identifies the calibration in results."""
 
 import contextlib
 import os
@@ -29,9 +29,9 @@ FORMAT = "knee_gap_calibration 1"
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration; the file appears whole or not at all.
+    """Write a calibration; the file is written completely or not at all.
 
-    Raises PerceptionError for one that could not be read again, and where the file cannot be written.
+    Raises PerceptionError if the calibration would not be valid when read, or if it cannot be written.
     """
     if flaw := broken_rule(calibration):
         raise PerceptionError(f"this calibration cannot be used: {flaw}; record again")
@@ -51,25 +51,23 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
 
 def require_place(path: Path) -> None:
-    """Raise PerceptionError where no calibration can be written, before it has taken minutes to make."""
+    """Raise PerceptionError if a calibration cannot be written there, before minutes of computation."""
     is_other = os.path.lexists(path) and not path.is_file()
     if is_other or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise PerceptionError(
-            f"{path} cannot be written: it must name a file in a folder that may be written"
-        )
+        raise PerceptionError(f"{path} cannot be written: name a file in a writable folder")
 
 
 def load_calibration(path: Path) -> Calibration:
     """Read a calibration.
 
-    Raises PerceptionError for a file that is missing, is no calibration, lacks values or was changed by hand.
+    Raises PerceptionError if the file is missing, not a calibration, incomplete, or was changed by hand.
     """
     try:
         content = read_yaml(path)
     except FileError as error:
         raise PerceptionError(f"the calibration cannot be read: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise PerceptionError(f"{path} is no calibration: its format must be '{FORMAT}'")
+        raise PerceptionError(f"{path} is not a calibration: its format must be '{FORMAT}'")
     try:
         calibration = _from_dict(content)
     except KeyError as error:

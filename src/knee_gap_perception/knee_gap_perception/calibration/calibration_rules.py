@@ -1,4 +1,4 @@
-"""What the numbers of a calibration must obey: a file may carry the right hash over numbers that are none."""
+"""Validation rules for a calibration, since a file with a correct hash can still contain invalid values."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from knee_gap_perception.camera.models import MODELS
 # The largest image that is read [px], and the largest offset that calibration looks for [s].
 MOST_PX = 16_384
 MOST_CLOCK_OFFSET = 10.0
-# Rounding of what is written, and of covariances that were inverted.
+# Tolerance for rounding in the file, and of inverted covariances.
 UNIT_TOLERANCE = 1e-6
 CORRELATION_TOLERANCE = 1e-6
 
 
 def broken_rule(calibration: "Calibration") -> str:
-    """Return the first rule that a calibration breaks, in words; empty where it breaks none."""
+    """Return the first rule that a calibration breaks, in words; empty if it breaks none."""
     for size in (calibration.width_px, calibration.height_px):
         if not 1 <= size <= MOST_PX:
             return f"the image's size must lie in [1, {MOST_PX}] px, not {size}"
@@ -30,9 +30,9 @@ def broken_rule(calibration: "Calibration") -> str:
 
 
 def covariance_flaw(covariance: Array, *, may_be_fixed: int = 0) -> str:
-    """Return why a matrix (n, n) is not the covariance of n unknowns; empty where it is one.
+    """Return why a matrix (n, n) is not a covariance of n unknowns; empty if it is.
 
-    The last `may_be_fixed` unknowns may have no variance; any other without one would be believed blindly.
+    Only the last `may_be_fixed` unknowns may have no variance; others would be treated as exact.
     """
     if not np.isfinite(covariance).all():
         return "has entries that are not finite"
@@ -41,7 +41,7 @@ def covariance_flaw(covariance: Array, *, may_be_fixed: int = 0) -> str:
     if (variances < 0.0).any() or not free[: len(variances) - may_be_fixed].all():
         return "has a variance that is not above 0"
     if covariance[~free].any() or covariance[:, ~free].any():
-        return "relates an unknown that has no variance to others"
+        return "has a covariance with an unknown of no variance"
     sigma = np.sqrt(variances[free])
     correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
     if not np.isfinite(correlation).all():
@@ -92,7 +92,7 @@ def _oblique_flaw(oblique: "Oblique | None") -> str:
     if oblique is None:
         return ""
     if np.isinf(oblique.notch_angle):
-        return "oblique: the notch's angle must be finite, or NaN where it was not seen"
+        return "oblique: the notch's angle must be finite, or NaN if it was not detected"
     if oblique.axis is not None:
         if not np.isfinite(oblique.axis.point).all():
             return "oblique: the axis must be finite"

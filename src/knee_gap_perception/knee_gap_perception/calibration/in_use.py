@@ -1,4 +1,4 @@
-"""The calibration that a node uses, and the medium that the scope is used in: named by parameters."""
+"""Parameters of the calibration in use: its file, the medium of use, and the scope's rotation."""
 
 from dataclasses import dataclass, field
 
@@ -12,7 +12,7 @@ from knee_gap_perception.parameters import check_parameters
 
 @dataclass(frozen=True)
 class CalibrationParameters:
-    """Which calibration is used, in which medium, and whether the scope is turned.
+    """Calibration file, medium of use, and whether the rotation of the scope is tracked.
 
     Raises PerceptionError for a bad value.
     """
@@ -20,23 +20,23 @@ class CalibrationParameters:
     calibration_file: str = field(
         default="",
         metadata={
-            "description": "File that `calibrate` wrote: lens on the body, clock and camera; the same for "
+            "description": "File written by `calibrate`: lens on the body, clock and camera; the same for "
             "segmentation_node and tracking_node; empty: none"
         },
     )
     medium: str | float = field(
         default="saline",
         metadata={
-            "description": f"What the scope is used in: {CHOICES}; angles of a camera that was calibrated in "
+            "description": f"Medium in which the scope is used: {CHOICES}; angles of a camera calibrated in "
             "another medium are converted; the same for segmentation_node and tracking_node"
         },
     )
     scope_rotation_notch: bool = field(
         default=False,
         metadata={
-            "description": "Whether the notch in each image tells how far an oblique scope is turned in its "
-            "camera head; the same for segmentation_node and tracking_node; needs a calibration_file of "
-            "`calibrate oblique`"
+            "description": "Whether the rotation of an oblique scope in its camera head is measured by the "
+            "notch in each image; the same for segmentation_node and tracking_node; needs a "
+            "calibration_file of `calibrate oblique`"
         },
     )
 
@@ -50,11 +50,11 @@ class CalibrationParameters:
 
     @property
     def used_in(self) -> Medium:
-        """The medium that the scope is used in."""
+        """The medium in which the scope is used."""
         return medium_of(self.medium, "medium")
 
     def load(self) -> Calibration | None:
-        """The calibration, None where none is named. Raises PerceptionError where it cannot be used."""
+        """The calibration, None if no file is named. Raises PerceptionError if it cannot be used."""
         if not self.calibration_file:
             return None
         try:
@@ -65,5 +65,5 @@ class CalibrationParameters:
 
 
 def hash_or_none(calibration: Calibration | None) -> str:
-    """What diagnostics say of the calibration: its hash, or "none"."""
+    """Text for the diagnostics: the hash of the calibration, or "none"."""
     return calibration.hash if calibration is not None else "none"

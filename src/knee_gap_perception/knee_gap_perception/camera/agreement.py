@@ -1,17 +1,17 @@
-"""Whether two models of one camera say the same."""
+"""Comparison of two models of one camera."""
 
 import numpy as np
 
 from knee_gap_perception.camera.models import Camera
 
-# Half of a degree [rad]: 4 px of a usual scope, far beyond the errors of a calibration.
+# Half a degree [rad]: 4 px of a usual scope, far beyond the errors of a calibration.
 NOTABLE = np.radians(0.5)
-# Share of the image's half height in which both are compared: a model says little of what it never saw.
+# Fraction of the image's half height within which they are compared: a model is unreliable beyond its data.
 INNER = 0.7
 
 
 def disagreement(one: Camera, other: Camera) -> str:
-    """By how much the bearings of two cameras differ, in words; empty where it is nothing to speak of."""
+    """Difference between the bearings of two cameras, in words; empty if it is negligible."""
     sizes = [(camera.width_px, camera.height_px) for camera in (one, other)]
     if sizes[0] != sizes[1]:
         return f"its image size, {sizes[1][0]}x{sizes[1][1]} against {sizes[0][0]}x{sizes[0][1]} px"

@@ -1,4 +1,4 @@
-"""What errors of the camera's own numbers do to a bearing: a displacement for each independent one."""
+"""Bearing errors due to errors of the intrinsics: a displacement for each independent error."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.camera.projection import LensModel
 
-# Of the largest variance, each parameter by its own: what a fit leaves of a parameter that it did not change.
+# Threshold relative to the largest normalised variance: less is the remainder of a fixed parameter.
 NEGLIGIBLE = 1e-9
 
 
 class BearingErrors:
-    """The independent errors of the intrinsics of one calibration, felt by any bearing."""
+    """Independent errors of the intrinsics of one calibration, and their effect on bearings."""
 
     def __init__(self, camera: Intrinsics) -> None:
         self._model, self._parameters = LensModel(camera.distortion_model), camera.parameters
@@ -25,7 +25,7 @@ class BearingErrors:
     def of(self, bearings: Array) -> Array:
         """Displacements (n, 3, k) [rad] of bearings (n, 3) by one standard deviation of each error.
 
-        The pixel stays: of what the projection of the bearing moves, the bearing has to take back.
+        The pixel is fixed: the bearing moves so as to compensate the shift of its projection.
         """
         seen = self._model.project(bearings, self._parameters)
         moved = seen.by_parameter @ self._root

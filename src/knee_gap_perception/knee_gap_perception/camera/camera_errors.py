@@ -1,7 +1,7 @@
-"""What is not known of a camera in use: displacements of a bearing, the same error in all images.
+"""Systematic errors of a camera in use: displacements of a bearing by errors that all images share.
 
-They come from the camera's own numbers and, where it was calibrated in another medium than it is used in,
-from the window between: its index, its tilt and curvature, and the pupil behind it.
+They come from the intrinsics and, if the camera was calibrated in another medium than it is used in, from the
+window: the medium's index, the window's tilt and curvature, and the pupil behind it.
 """
 
 from collections.abc import Sequence
@@ -14,26 +14,26 @@ from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.camera.models import Camera, camera_in_medium, refracted
 
 MOST_ERRORS = 9  # independent errors that knee_gap_msgs/GapEdges holds
-# Of the window, standard deviations: of its tilt about each image axis [rad] (windows are cemented to some
-# tenths of a degree), and of its curvature [1/m] (a sag of 6 um over 3 mm).
+# Standard deviations of the window's tilt about each image axis [rad] (windows are cemented to some tenths of
+# a degree), and of its curvature [1/m] (a sag of 6 um over 3 mm).
 WINDOW_TILT = np.radians(0.5)
 WINDOW_CURVATURE = 1.0 / 0.2
-# RMS distance from the window back to the entrance pupil [m]: it is not known, and at most some 1.5 mm.
+# RMS distance from the window back to the entrance pupil [m]: it is unknown, and at most about 1.5 mm.
 PUPIL_DEPTH = 0.75e-3
-# At which a pupil that moves with the angle counts [m]; gaps are 8-15 mm away, and the nearest feel it most.
+# Distance for the effect of a pupil that moves with the angle [m]: gaps are 8-15 mm away, worst if near.
 NEAR = 0.008
-GRID = 15  # points across the picture, over which errors are compared
+GRID = 15  # points across the field of view at which errors are compared
 
 
 class ErrorSource(Protocol):
-    """Independent errors of a camera's own numbers."""
+    """Interface of the independent errors of the intrinsics."""
 
     def of(self, bearings: Array) -> Array:
         """Displacements (n, 3, k) [rad] of bearings (n, 3) by one standard deviation of each error."""
 
 
 class WindowErrors:
-    """What Snell's law at a perfect window leaves out, from the medium of a calibration to that in use."""
+    """Deviations from Snell's law at a perfect window, from the calibration's medium to that in use."""
 
     def __init__(self, calibrated_in: Medium, use: Medium) -> None:
         self._ratio = calibrated_in.ratio_to(use)
@@ -42,7 +42,7 @@ class WindowErrors:
     def of(self, bearings: Array) -> Array:
         """Displacements (n, 3, 5) [rad], in use, of bearings (n, 3) at the calibration.
 
-        By the index, the window's tilt about y and about x, its curvature, and the pupil behind it.
+        In order: due to the index, the window's tilt about y and about x, its curvature, and the pupil.
         """
         zero = np.zeros((len(bearings), 2))
         axis = np.array([0.0, 0.0, 1.0])
@@ -53,8 +53,8 @@ class WindowErrors:
         # A ray at the angle a meets the window PUPIL_DEPTH tan(a) from its middle.
         off_middle = PUPIL_DEPTH * bearings[:, :2] / bearings[:, 2:]
         by_curvature = self._tilted(bearings, WINDOW_CURVATURE * off_middle)
-        # The rays of a pupil behind the window seem to come from a place behind it that depends on the angle:
-        # PUPIL_DEPTH tan(a) / tan(a in use). What all angles share is a shift of the lens, not of a bearing.
+        # The rays of a pupil behind the window appear to come from a depth that depends on the angle:
+        # PUPIL_DEPTH tan(a) / tan(a in use). The part common to all angles shifts the lens, not a bearing.
         paraxial = 1.0 / self._ratio
         recedes = PUPIL_DEPTH * (in_use[:, 2] / bearings[:, 2] / self._ratio - paraxial)
         across = axis - in_use[:, 2:] * in_use
@@ -76,18 +76,18 @@ class WindowErrors:
 
 
 def pupil_shift(calibrated_in: Medium, use: Medium) -> float:
-    """Standard deviation [m] of how far the lens moves along its view from a calibration's medium to another.
+    """Standard deviation [m] of the shift of the lens along its view between two media.
 
-    The image of the pupil, of unknown distance behind the window, moves with the index ahead of it.
+    The image of the pupil, at an unknown distance behind the window, moves with the index in front of it.
     """
     return PUPIL_DEPTH * abs(1.0 / calibrated_in.ratio_to(use) - 1.0)
 
 
 class CameraErrors:
-    """The independent errors of a camera in use, at most nine, felt by any bearing in use.
+    """Independent errors of a camera in use, at most nine, and their effect on bearings in use.
 
-    `camera` is that of the calibration, in `calibrated_in`; `sources` are the errors of its numbers, as
-    angles in that medium.
+    `camera` is the calibrated camera, in the medium `calibrated_in`; `sources` are the errors of its
+    intrinsics, as angles in that medium.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class CameraErrors:
             self._mixed = _mixture(picture)
 
     def of(self, bearings: Array) -> Array:
-        """Displacements (n, 3, k) [rad] of bearings (n, 3) in use; k is 0 where no error is known."""
+        """Displacements (n, 3, k) [rad] of bearings (n, 3) in use; k is 0 if no error is known."""
         moved = self._all(bearings)
         return moved if self._mixed is None else np.asarray(moved @ self._mixed)
 
@@ -115,14 +115,14 @@ class CameraErrors:
         return np.concatenate([*carried, self._window.of(calibrated)], axis=-1)
 
     def _carried(self, bearings: Array, moved: Array) -> Array:
-        """Displacements (n, 3, k) at the calibration as those of the bearings (n, 3) in use."""
+        """Displacements (n, 3, k) at the calibration, converted to those of the bearings (n, 3) in use."""
         side = self._ratio * moved[:, :2]
         ahead = -np.einsum("ni,nik->nk", bearings[:, :2], side) / bearings[:, 2:]
         return np.concatenate([side, ahead[:, None]], axis=1)
 
 
 def _over_picture(camera: Camera) -> Array:
-    """Bearings (n, 3) over the picture, a disc as high as the image; without those outside the model."""
+    """Bearings (n, 3) over a disc as high as the image, without those outside the model."""
     centre = np.array([camera.width_px - 1.0, camera.height_px - 1.0]) / 2.0
     radius = min(camera.width_px, camera.height_px) / 2.0
     side = np.linspace(-radius, radius, GRID)
@@ -132,14 +132,14 @@ def _over_picture(camera: Camera) -> Array:
 
 
 def _mixture(picture: Array) -> Array:
-    """(k, MOST_ERRORS) by which k independent errors of a picture's bearings (n, 3, k) become fewer.
+    """Matrix (k, MOST_ERRORS) that reduces k independent errors of bearings (n, 3, k) to fewer.
 
-    The largest principal errors are kept; those that there is no room for are added to the variance of the
-    last, so that the variance over the picture stays.
+    The largest principal errors are kept. The variance of the others is added to the last, so that the
+    variance over the field of view stays the same.
     """
     count = picture.shape[-1]
     finite = picture[np.isfinite(picture).all(axis=(1, 2))].reshape(-1, count)
-    # Rows of zeros, for a picture of too few directions.
+    # Rows of zeros, if there are too few directions.
     _, sizes, axes = np.linalg.svd(np.concatenate([finite, np.zeros((count, count))]), full_matrices=False)
     mixed = axes[:MOST_ERRORS].T.copy()
     rest = np.linalg.norm(sizes[MOST_ERRORS - 1 :])

@@ -14,8 +14,8 @@ class Intrinsics:
 
     `covariance` (m, m) is of fx, fy, cx, cy [px] and `d`, in this order; rows of fixed parameters are 0.
     `rms_px` is the RMS distance of a point, `sigma_px` the standard deviation of one coordinate.
-    `design_effect` is how many neighbouring points count as one, because what the model does not describe
-    moves them together; the covariance includes it.
+    `design_effect` is the number of neighbouring points that count as one, because deviations from the model
+    move them together; the covariance includes it.
     """
 
     width: int

@@ -1,4 +1,4 @@
-"""Media in front of the scope's window: their refractive indices, and how well these are known.
+"""Media in front of the scope's window: their refractive indices and the errors of these.
 
 A scope is calibrated in one medium and used in another. At a flat window perpendicular to the view
 sin(angle in use) n_use = sin(angle at the calibration) n_calibration (Snell), whatever glass lies between.
@@ -11,9 +11,9 @@ from typing import Any
 from knee_gap_perception.errors import PerceptionError
 
 INDICES = {"air": 1.0, "saline": 1.336, "water": 1.333}
-# The index of saline lies in 1.330-1.340, by its temperature, its salt and the colour of the light: the
-# standard deviation of an even distribution is half of that range by the root of 3. That of a gas is
-# negligible.
+# The index of saline is 1.330-1.340, depending on temperature, salinity and the colour of the light. The
+# standard deviation of a uniform distribution is half that range divided by the square root of 3. The error
+# of a gas is negligible.
 LIQUID_ERROR = 0.003
 HIGHEST_GAS = 1.01
 LOWEST, HIGHEST = 1.0, 1.6
@@ -33,7 +33,7 @@ class Medium:
 
     @property
     def value(self) -> str | float:
-        """Its name, or the index of a medium without one: what `medium_of` takes."""
+        """Its name, or the index of a medium without a name, as accepted by `medium_of`."""
         return next((name for name, index in INDICES.items() if index == self.index), self.index)
 
     def ratio_to(self, use: "Medium") -> float:
@@ -51,7 +51,7 @@ AIR, SALINE, WATER = (Medium(index) for index in INDICES.values())
 
 
 def medium_of(value: Any, name: str = "the medium") -> Medium:
-    """The medium that a parameter or an argument `name` gives, a name or an index, also as text.
+    """The medium given by a parameter or argument `name`: a name or an index, also as text.
 
     Raises PerceptionError for anything else.
     """

@@ -1,7 +1,7 @@
-"""Camera models: pixels of the image to directions in the optical frame, and back.
+"""Camera models: conversion of pixels to directions in the optical frame, and back.
 
 Pixels are (column, row), (0, 0) the centre of the first pixel. The optical frame is REP-103's: z along the
-view, x to the right, y down. A pixel or a direction that a model does not describe gives NaN, never a guess.
+view, x to the right, y down. A pixel or direction outside the model gives NaN.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,16 +14,16 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Array
 from knee_gap_perception.errors import PerceptionError
 
-# Coefficients, focal lengths and centres beyond this [-, px] are no camera's, and overflow when multiplied.
+# Largest coefficient, focal length and centre [-, px]: larger ones are not plausible, and products overflow.
 LARGEST_NUMBER = 1e6
 SHORTEST_FOCAL = 1e-3  # [px]
-PIXEL_TOLERANCE = 1e-6  # [px] what a pixel may move when it is taken to a direction and back
-NO_TERM = 1e-30  # [-] of a polynomial's largest term, below which another is none
+PIXEL_TOLERANCE = 1e-6  # [px] largest change of a pixel after conversion to a direction and back
+NO_TERM = 1e-30  # [-] relative to a polynomial's largest term: smaller terms are ignored
 TABLE_SIZE = 2048  # samples of a distortion curve, from which its inverse starts
 
 
 class Camera(Protocol):
-    """What the rest of the package asks of a camera."""
+    """Interface of a camera model."""
 
     @property
     def width_px(self) -> int:
@@ -53,7 +53,7 @@ def bearing_jacobian(camera: Camera, pixel: npt.ArrayLike) -> Array:
 
 
 class _Coarseness:
-    """The angle of a pixel, the same for every model."""
+    """Angle spanned by a pixel, computed in the same way for every model."""
 
     def radians_per_pixel(self: Camera, pixel: npt.ArrayLike) -> float:
         """Angle [rad] that one pixel spans at a pixel (2,), along the coarser direction; NaN outside."""
@@ -97,9 +97,9 @@ def _coefficients(distortion: Sequence[float], allowed: tuple[int, ...], model: 
 
 
 def _first_positive_root(coefficients: npt.ArrayLike, limit: float) -> float:
-    """Smallest positive real root of a polynomial, highest power first; `limit` where none is below it."""
+    """Smallest positive real root of a polynomial, highest power first; `limit` if none is below it."""
     polynomial = np.asarray(coefficients, dtype=np.float64)
-    # A term that changes nothing below the limit is left out: its roots lie beyond every number.
+    # A term that has no effect below the limit is left out: its roots would overflow.
     terms = np.abs(polynomial) * limit ** np.arange(len(polynomial) - 1, -1, -1)
     polynomial = np.where(terms > NO_TERM * terms.max(), polynomial, 0.0)
     roots = np.roots(polynomial)
@@ -206,7 +206,7 @@ class PinholeCamera(_Coarseness):
         return np.asarray(np.polyval(self._numerator, r) / np.polyval(self._denominator, r))
 
     def _distort(self, plane: Array) -> Array:
-        """Points of the plane z = 1 (..., 2) where the distorting lens puts them."""
+        """Distorted points (..., 2) of the plane z = 1."""
         x, y = plane[..., 0], plane[..., 1]
         p1, p2, s1, s2, s3, s4 = self._tangential
         r2 = x * x + y * y
@@ -382,12 +382,12 @@ class RefractedCamera(_Coarseness):
 
 
 def camera_in_medium(camera: Camera, index_ratio: float) -> Camera:
-    """The camera where the sine of an angle is `index_ratio` times the calibrated one: itself for 1."""
+    """The camera with the sines of all angles multiplied by `index_ratio`; itself for 1."""
     return camera if index_ratio == 1.0 else RefractedCamera(camera, index_ratio)
 
 
 class CameraInfo(Protocol):
-    """The fields of sensor_msgs/CameraInfo that are read, of ROS's own class or any other."""
+    """The fields of sensor_msgs/CameraInfo that are used, of ROS's own class or any other."""
 
     height: int
     width: int
@@ -407,8 +407,8 @@ MODELS: dict[str, Callable[..., Camera]] = {
 def camera_from_info(info: CameraInfo) -> Camera:
     """The camera that a sensor_msgs/CameraInfo describes.
 
-    Raises PerceptionError for an unknown distortion model, an uncalibrated camera, and images that are binned
-    or cut out of a larger one.
+    Raises PerceptionError for an unknown distortion model, an uncalibrated camera, and binned or cropped
+    images.
     """
     if info.distortion_model not in MODELS:
         choices = ", ".join(MODELS)
@@ -420,7 +420,7 @@ def camera_from_info(info: CameraInfo) -> Camera:
     roi = getattr(info, "roi", None)
     if roi is not None and (roi.x_offset, roi.y_offset) != (0, 0):
         raise PerceptionError(
-            "camera_info must describe the whole image, but its region starts at "
+            "camera_info must describe the whole image, but its region of interest starts at "
             f"({roi.x_offset}, {roi.y_offset}) px"
         )
     k = np.asarray(info.k, dtype=np.float64)

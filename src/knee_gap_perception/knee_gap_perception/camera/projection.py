@@ -1,7 +1,7 @@
-"""Points in front of the lens to pixels, with the derivatives that a fit needs (OpenCV's projections).
+"""Projection of points to pixels with derivatives, for fits of the lens (OpenCV's projections).
 
-Parameters are one array: fx, fy, cx, cy, then the coefficients of the model. The camera of a *fitted* lens,
-for measuring, is `knee_gap_perception.camera.models`.
+Parameters are one array: fx, fy, cx, cy, then the coefficients of the model. The camera model of a *fitted*
+lens, for measurements, is in `knee_gap_perception.camera.models`.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ NAMES = {
     "plumb_bob": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
     "equidistant": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-# Terms that a board fills an image too sparsely to tell from the others are fixed at 0 unless asked for.
+# High-order terms, fixed at 0 by default: a board covers the image too sparsely to determine them.
 HIGH_ORDER = {"plumb_bob": ("k3",), "equidistant": ("k3", "k4")}
 
 
@@ -32,7 +32,7 @@ class Projection(NamedTuple):
 
 @dataclass(frozen=True)
 class LensModel:
-    """A distortion model of sensor_msgs/CameraInfo and which of its parameters a fit may change."""
+    """A distortion model of sensor_msgs/CameraInfo and its free parameters in a fit."""
 
     distortion_model: str
     high_order: bool = False
@@ -77,7 +77,7 @@ class LensModel:
         )
 
     def plane(self, pixels: Array, parameters: Array) -> Array:
-        """Points (n, 2) of the plane z = 1 that are seen at pixels (n, 2)."""
+        """Points (n, 2) of the plane z = 1 behind pixels (n, 2)."""
         K, d = _matrix(parameters), parameters[4:]
         if self.distortion_model == "equidistant":
             return np.asarray(cv2.fisheye.undistortPoints(pixels[:, None], K, d)[:, 0], dtype=np.float64)

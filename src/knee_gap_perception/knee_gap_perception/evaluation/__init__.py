@@ -1,1 +1,1 @@
-"""Error of predicted gap masks against marked ones."""
+"""Errors of predicted gap masks compared with marked ones."""

@@ -1,4 +1,4 @@
-"""The picture of figure 8d: where a segmented and a marked gap agree and differ, in the paper's colours."""
+"""Difference picture of a segmented and a marked gap, in the colours of the paper's figure 8d."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ PANEL_ROWS = 240
 
 
 def difference_picture(predicted: Mask, marked: Mask, error: EdgeError | None = None) -> Image:
-    """Colours of agreement (h, w, 3), blue green red; the gap points are drawn where an error is given."""
+    """Colours of agreement (h, w, 3), blue green red; the gap points are drawn if an error is given."""
     picture = np.empty((*marked.shape, 3), dtype=np.uint8)
     picture[predicted & marked], picture[~predicted & ~marked] = TP, TN
     picture[predicted & ~marked], picture[~predicted & marked] = FP, FN

@@ -1,17 +1,17 @@
-"""How far a segmented gap is from a marked one: overlap, and the error at the two gap points (paper, II-E).
+"""Image error of a segmented gap: overlap with a marked gap, and errors at the two gap points (paper, II-E).
 
-The paper measures "errors around the two gap points" (figure 4a, Table 2) and leaves the procedure to a
-figure. Here:
+The paper measures "errors around the two gap points" (figure 4a, Table 2) and defines the procedure by a
+figure only. Here:
 
-- The section is that of the *marked* gap: the largest disc inscribed in it, and through its centre the
-  direction in which the gap is narrowest. G0 and G1 are where the marked gap ends along that direction; G0
-  is the upper one, or the left one of two at the same height.
-- Around each point, on lines parallel to the section up to the disc's radius to either side of it, the
-  distance along the line between the end of the marked gap and the end of the predicted gap is taken: the
-  white areas of figure 4a. The predicted gap on a line reaches over all its runs of pixels that overlap the
-  marked run: a hole inside is no error of the edge.
-- The error of a point is the RMS over its lines, in pixels, and as the angle between the two ends under the
-  camera model. Lines on which nothing was predicted have no error; their share is told as `missed`.
+- The section is that of the *marked* gap: the largest inscribed disc, and through its centre the direction in
+  which the gap is narrowest. G0 and G1 are the ends of the marked gap along that direction; G0 is the upper
+  one, or the left one of two at the same height.
+- Around each point, on lines parallel to the section up to the disc's radius on either side, the distance
+  along the line between the end of the marked gap and the end of the predicted gap is measured: the white
+  areas of figure 4a. On a line, the predicted gap consists of all its runs of pixels that overlap the marked
+  run, so a hole inside is not an error of the edge.
+- The error of a point is the RMS over its lines, in pixels, and as the angle between the two ends by the
+  camera model. Lines without a prediction have no error; their fraction is reported as `missed`.
 """
 
 from dataclasses import dataclass
@@ -40,17 +40,17 @@ class Overlap(NamedTuple):
 
     @property
     def dice(self) -> float:
-        """2 TP / (2 TP + FP + FN); 1 where both masks are empty."""
+        """2 TP / (2 TP + FP + FN); 1 if both masks are empty."""
         total = 2 * self.tp + self.fp + self.fn
         return 2 * self.tp / total if total else 1.0
 
 
 @dataclass(frozen=True)
 class EdgeError:
-    """RMS error at G0 and G1 (2,) in pixels and as an angle [rad], NaN where nothing was predicted there.
+    """RMS error at G0 and G1 (2,) in pixels and as an angle [rad], NaN without a prediction there.
 
     `points` (2, 2) are the gap points in the marked mask [px]; `squares_px` and `squares` (2, LINES) the
-    squared error of each line, NaN where the line has none; `missed` (2,) the share of lines without a
+    squared error of each line, NaN if the line has none; `missed` (2,) the fraction of lines without a
     prediction.
     """
 
@@ -70,12 +70,12 @@ class EdgeError:
 
     @property
     def missed(self) -> Array:
-        """Share (2,) of lines on which no gap was predicted."""
+        """Fraction (2,) of lines without a predicted gap."""
         return np.asarray(np.isnan(self.squares_px).mean(axis=1))
 
 
 def rms(squares: Array) -> Array:
-    """Root of the mean over the last axis of what is known; NaN where nothing is."""
+    """Root of the mean over the last axis, ignoring NaN; NaN if all are NaN."""
     known = np.isfinite(squares)
     count = known.sum(axis=-1)
     total = np.where(known, squares, 0.0).sum(axis=-1)
@@ -83,7 +83,7 @@ def rms(squares: Array) -> Array:
 
 
 def overlap(predicted: Mask, marked: Mask) -> Overlap:
-    """Pixels in which masks (h, w) agree and differ. Raises PerceptionError for masks of different size."""
+    """Counts of pixels in which masks (h, w) agree and differ. Raises PerceptionError if sizes differ."""
     if predicted.shape != marked.shape:
         raise PerceptionError(
             f"masks must have one size, not {predicted.shape[1]}x{predicted.shape[0]} px predicted and "
@@ -95,7 +95,7 @@ def overlap(predicted: Mask, marked: Mask) -> Overlap:
 
 
 def edge_error(predicted: Mask, marked: Mask, camera: Camera) -> EdgeError | None:
-    """Error of a predicted gap (h, w) at the two points of the marked one; None where no gap is marked.
+    """Error of a predicted gap (h, w) at the two points of the marked one; None if no gap is marked.
 
     Raises PerceptionError for masks of different size, or another size than the camera's.
     """
@@ -117,7 +117,7 @@ def edge_error(predicted: Mask, marked: Mask, camera: Camera) -> EdgeError | Non
     for i, start in enumerate(starts):
         line = start + distance[:, None] * across
         runs = _runs(_sampled(marked, line))
-        # Of the marked runs on a line, the one that passes nearest to the section's centre.
+        # Of the marked runs on a line, use the one nearest to the section's centre.
         marked_run = min(runs, key=lambda run: _away(run, len(line) // 2), default=None)
         if marked_run is None:
             continue
@@ -148,7 +148,7 @@ def _section(marked: Mask) -> tuple[Array, Array, float] | None:
     for side in (1.0, -1.0):
         inside = _sampled(marked, centre + side * reach[:, None] * directions[:, None, :])
         width += np.where(inside.all(axis=1), np.inf, (~inside).argmax(axis=1))
-    # Of directions that are equally narrow, the middle one.
+    # Of equally narrow directions, use the middle one.
     narrow = directions[width <= width.min() + 1]
     across = narrow[0] if len(narrow) == 1 else _mean_axis(narrow)
     # From the upper or left end to the other, so that G0 is the first.
@@ -158,7 +158,7 @@ def _section(marked: Mask) -> tuple[Array, Array, float] | None:
 
 
 def _mean_axis(directions: Array) -> Array:
-    """Mean of directions that have no sign."""
+    """Mean of directions without sign."""
     values, vectors = np.linalg.eigh(directions.T @ directions)
     return np.asarray(vectors[:, values.argmax()])
 
@@ -174,13 +174,13 @@ def _sampled(mask: Mask, pixels: Array) -> Mask:
 
 
 def _runs(line: Mask) -> list[tuple[int, int]]:
-    """Begin and end of each run of True."""
+    """Start and end of each run of True."""
     edges = np.diff(np.concatenate([[0], line.astype(np.int8), [0]]))
     return list(zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True))
 
 
 def _away(run: tuple[int, int], middle: int) -> int:
-    """Samples between a run and the middle of a line; 0 where it lies on it."""
+    """Number of samples between a run and the middle of a line; 0 if the run contains it."""
     return max(run[0] - middle, middle - run[1] + 1, 0)
 
 

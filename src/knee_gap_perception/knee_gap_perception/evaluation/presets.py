@@ -1,7 +1,7 @@
-"""The image errors that the paper measured on cadavers (Table 2), to set `angular_error` to.
+"""Presets of the image error: the paper's measurements on cadavers (Table 2), for `angular_error`.
 
-The paper's text takes 2.36 degrees for the medial compartment; its Table 2 has that number in the row of the
-patello-femoral joint. The labels here are Table 2's own.
+The paper's text gives 2.36 degrees for the medial compartment; its Table 2 has that number in the row of the
+patello-femoral joint. The labels here are those of Table 2.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from knee_gap_perception.errors import PerceptionError
 
 @dataclass(frozen=True)
 class ImageErrorPreset:
-    """One row of Table 2: where in the knee, and the RMS errors [rad] at G0 and G1 and their average."""
+    """One row of Table 2: compartment of the knee, and RMS errors [rad] at G0 and G1 and their average."""
 
     location: str
     image_set: int
@@ -32,7 +32,7 @@ PRESETS = {
 
 
 def image_error_preset(name: str) -> ImageErrorPreset:
-    """The row of Table 2 of a name. Raises PerceptionError for a name that is none."""
+    """Row of Table 2 by name. Raises PerceptionError for an unknown name."""
     if name not in PRESETS:
         raise PerceptionError(f"the image error preset must be one of {', '.join(PRESETS)}, not '{name}'")
     return PRESETS[name]

@@ -1,1 +1,1 @@
-"""Detection of the instrument gap in one image, and the confidence in it."""
+"""Detection of the instrument gap in one image, and its confidence."""

@@ -1,4 +1,4 @@
-"""How sharply the dark part of a picture ends on either side: shade ends slowly."""
+"""Sharpness of the border of a dark part of the image, which distinguishes a gap from shade."""
 
 import cv2
 import numpy as np
@@ -7,26 +7,26 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_perception.image.field_of_view import FieldOfView
 
-AROUND = 10  # [px at working size] to either side of the border in which its sharpness is judged
-ALONG = 60.0  # [px at working size] to either side of the section over which the border is judged
+AROUND = 10  # [px at working size] on either side of the border in which its sharpness is measured
+ALONG = 60.0  # [px at working size] on either side of the section over which the border is measured
 MOST_LINES = 64  # across the border of a side
 LEAST_LINES = 8
 SHARP = 3  # [px at working size] over which a sharp edge rises
-LEAST_RANGE = 4.0  # [grey levels]: noise is no edge
+LEAST_RANGE = 4.0  # [grey levels]: less is noise
 FACING = 0.5  # [-] cosine to the section from which a piece of the border belongs to one of its sides
-BEYOND = 6  # [px at working size] from the border, where no foreign body may be
+BEYOND = 6  # [px at working size] from the border, within which no instrument or glare may be
 INSIDE = 2.0  # [px at working size] inside the field, where a line must end
 
 
 def border_sharpness(
     part: Mask, centre: Array, across: Array, value: Image, foreign: Mask, field: FieldOfView, scale: float
 ) -> Array:
-    """Share (2,) of the rise around the border that falls within a few pixels, on either side of a section.
+    """Fraction (2,) of the rise across the border that falls within a few pixels, on each side of a section.
 
-    The median over lines across the border of the dark `part` (h, w): one place may happen to be crisp in
-    the texture of a shaded flank, or blurred by what drifts past. All is at working size, `scale` times the
-    full one: the section's centre (2,) [px] and unit vector (2,) towards side 1, brightness and foreign
-    bodies (h, w). A side with hardly any border to be seen has 0.
+    It is the median over lines across the border of the dark `part` (h, w), since a single place can be sharp
+    in the texture of a shaded flank, or blurred by drifting debris. All inputs are at working size, `scale`
+    times the full size: the section's centre (2,) [px] and unit vector (2,) towards side 1, brightness and
+    instruments and glare (h, w). A side with hardly any visible border has 0.
     """
     border, outward = _border(part)
     ends = (border + AROUND * outward + 0.5) / scale - 0.5
@@ -49,7 +49,7 @@ def _border(part: Mask) -> tuple[Array, Array]:
     """Pixels (n, 2) of the border of a part (h, w), and the unit vectors (n, 2) out of it there."""
     contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     border = np.concatenate([contour[:, 0] for contour in contours])
-    # Pixels are stairs: the direction is that of a smoothed part.
+    # The border of a mask is a staircase: the direction is that of the smoothed mask.
     soft = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 2.0)
     column, row = border.T
     outward = -np.stack(
@@ -61,7 +61,7 @@ def _border(part: Mask) -> tuple[Array, Array]:
 
 
 def _sharpness(smooth: npt.NDArray[np.float32], border: Array, outward: Array) -> float:
-    """Largest rise outwards over SHARP pixels against the range across the border (n, 2), median of lines."""
+    """Median over lines of the largest outward rise in SHARP pixels, relative to the range (n, 2)."""
     steps = np.arange(-AROUND, AROUND + 1)[:, None]
     places = (border[:, None] + steps * outward[:, None]).astype(np.float32)
     lines = cv2.remap(smooth, places[..., 0], places[..., 1], cv2.INTER_LINEAR)

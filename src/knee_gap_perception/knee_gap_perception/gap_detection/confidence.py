@@ -1,4 +1,4 @@
-"""How sure it is that a dark part of the picture is a gap."""
+"""Confidence that a dark part of the image is a gap."""
 
 import cv2
 import numpy as np
@@ -8,29 +8,29 @@ from knee_gap_perception.gap_detection.cross_section import Section
 
 # Logistic regression on sections of simulated knees (levels 0-3, open and closed joints) and of real frames
 # with a cleft (a nose) and without one (a laparoscope's), open and closed weighted alike.
-CONTRAST_WEIGHT = 6.1  # of its logarithm: what is no darker than its sides is no gap, however crisp it is
+CONTRAST_WEIGHT = 6.1  # of its logarithm: a part no darker than its sides is not a gap, however sharp
 BLUNT_WEIGHT = 6.1
 SHARP_WEIGHT = 4.6
 SHADE_WEIGHT = -13.1
 UNEVENNESS_WEIGHT = -14.4
 SLIT_WEIGHT = 12.3
 OFFSET = 7.3
-LEAST_CONTRAST = 0.05  # [-]: what is brighter than its sides by more tells nothing more
-MOST_UNEVEN = 0.45  # [-]: bone that is lit in the depth of a gap makes it more uneven than shade is
-WIDE = 0.1  # [-] radius of the disc against the field's, above which more tells nothing more
-NARROWEST = 0.03  # [-] the same, below which less tells nothing more
-LEVEL_OFFSET = 5.0  # [grey levels]: the noise of black is no unevenness
+LEAST_CONTRAST = 0.05  # [-] limit: lower values carry no further information
+MOST_UNEVEN = 0.45  # [-] limit: bone lit in the depth of a gap makes it more uneven than shade
+WIDE = 0.1  # [-] radius of the disc relative to the field's; upper limit
+NARROWEST = 0.03  # [-] the same; lower limit
+LEVEL_OFFSET = 5.0  # [grey levels]: so that the noise of black does not count as unevenness
 
 
 def gap_confidence(section: Section, field_radius: float, light: float, image: Image, dark: Mask) -> float:
     """Confidence [0, 1] that a section through dark pixels (h, w) of an image (h, w, 3) is a gap.
 
-    Through an opening one looks past an edge that hides what lies behind: the gap is dark against the tissue
-    on both sides, evenly so, and ends sharply. A crease under a condyle, where the bone turns away from the
-    lamp, may be darker than a gap, but both its sides sink into shade: they end slowly and are dark
-    themselves. Either alone is found beside gaps, an edge out of focus or one far from the lamp's beam; both
-    together are a crease. `field_radius` [px] is in the pixels of the section, `light` [grey levels] the
-    brightness of what is lit in full.
+    At an opening, an edge hides the tissue behind it: the gap is evenly dark against the tissue on both sides
+    and ends sharply. A crease under a condyle, where the bone turns away from the lamp, can be darker than a
+    gap, but both its sides fade into shade: they end slowly and are dark themselves. Either alone occurs at
+    gaps too, at an edge that is out of focus or far from the lamp's beam; both together mean a crease.
+    `field_radius` [px] is in the pixels of the section, `light` [grey levels] the brightness of fully lit
+    tissue.
     """
     sharper = float(section.sharpness.max())
     lit = min(float(section.levels[1:].max()) / light, 1.0)
@@ -47,7 +47,7 @@ def gap_confidence(section: Section, field_radius: float, light: float, image: I
 
 
 def unevenness(image: Image, dark: Mask) -> float:
-    """Spread of the darkness of dark pixels (h, w) of an image (h, w, 3), against its mean [-].
+    """Relative spread (against the mean) of the darkness of dark pixels (h, w) of an image (h, w, 3) [-].
 
     Darkness is the darker of green and blue, which a far wall that glows red does not change.
     """

@@ -1,4 +1,4 @@
-"""The section of the gap through which an instrument would pass, and the edges on either side of it."""
+"""The section of the gap through which an instrument would pass, and the edges on both sides of it."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from knee_gap_perception.gap_detection.border_sharpness import border_sharpness
 from knee_gap_perception.image.field_of_view import FieldOfView
 
 DIRECTIONS = 36  # across the gap, over half a turn
-SMOOTHED = 4  # directions to either side over which widths are levelled
+SMOOTHED = 4  # directions on either side over which widths are smoothed
 STEP = 0.5  # [px at working size] between the samples of a ray
 TISSUE_BEYOND = 6  # [px at working size] of tissue that must follow an edge
-CANDIDATES = 4  # dark parts looked at, largest first
+CANDIDATES = 4  # dark parts examined, largest first
 
 
 @dataclass(frozen=True)
 class Section:
     """The largest inscribed disc (centre [px], radius [px]) and the two edges across it (2, 2) [px].
 
-    `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,)
-    the step over each edge against the tissue's; `sharpness` (2,) that of the border on either side
+    `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,) the
+    step at each edge relative to the tissue's brightness; `sharpness` (2,) that of the border on each side
     (`border_sharpness`). Lengths are in pixels of the full image.
     """
 
@@ -44,10 +44,10 @@ def find_section(
 ) -> Section | None:
     """The best section through the dark pixels; None where no dark part has tissue on both sides.
 
-    `dark`, `value` (brightness) and `foreign` (what is no tissue) are (h, w) at working size, `scale` times
-    the full one; `region` is the centre [px] and radius [px] of the region of interest in the full image,
-    in which the disc's centre must lie. Of several dark parts the one with the largest disc is taken, discs
-    nearer the region's centre preferred.
+    `dark`, `value` (brightness) and `foreign` (instruments and glare) are (h, w) at working size, `scale`
+    times the full size; `region` is the centre [px] and radius [px] of the region of interest in the full
+    image, which must contain the disc's centre. Of several dark parts, the one with the largest disc is
+    chosen, with a preference for discs near the region's centre.
     """
     opened = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
@@ -58,11 +58,11 @@ def find_section(
     preference = np.where(away2 <= 1.0, 1.0 - 0.8 * away2, 0.0)
     best: tuple[float, Section] | None = None
     for label in order if count > 1 else ():
-        # No disc in it can be larger than itself.
+        # A disc cannot be larger than its dark part.
         if best is not None and np.sqrt(stats[label, cv2.CC_STAT_AREA] / np.pi) + 1.0 < best[0]:
             break
         part = (labels == label).astype(np.uint8)
-        # The padding keeps discs inside the frame.
+        # The padding keeps the discs inside the frame.
         distance = cv2.distanceTransform(
             cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT), cv2.DIST_L2, 5
         )
@@ -83,7 +83,7 @@ def find_section(
             if section is not None:
                 best = (float(score[row, column]), section)
                 break
-            # Tissue is missing on a side here: look elsewhere along the same part.
+            # There is no tissue on one side here: search elsewhere along the same part.
             radius = max(6.0, float(distance[row + 1, column + 1]))
             score = np.where((columns - column) ** 2 + (rows - row) ** 2 < radius**2, 0.0, score)
     return best[1] if best is not None else None
@@ -92,7 +92,7 @@ def find_section(
 def _section_through(
     centre: Array, radius: float, part: Mask, value: Image, foreign: Mask, field: FieldOfView, scale: float
 ) -> Section | None:
-    """The narrowest way across the gap through a point at working size, with tissue at both ends."""
+    """Narrowest line across the gap through a point at working size, with tissue at both ends."""
     angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     length = np.arange(0.0, 4.0 * radius + 20.0, STEP)
@@ -106,7 +106,7 @@ def _section_through(
         beyond = centre + sign * (first[:, None] + TISSUE_BEYOND) * directions
         full = (beyond + 0.5) / scale - 0.5
         depth = np.where(np.isfinite(full).all(axis=1), field.depth_inside(np.nan_to_num(full)), -1.0)
-        # An instrument or glare beside the gap is not its edge.
+        # An instrument or glare beside the gap is not an edge of it.
         column, row = np.rint(np.nan_to_num(beyond)).astype(int).T
         tissue = ~foreign[row.clip(0, part.shape[0] - 1), column.clip(0, part.shape[1] - 1)]
         reach[:, side] = np.where((depth > 0) & tissue, first, np.nan)
@@ -128,9 +128,9 @@ def _section_through(
 
 
 def _smoothed(width: Array) -> Array:
-    """Widths over half a turn (n,) levelled over neighbouring directions; NaN stays NaN.
+    """Widths over half a turn (n,), smoothed over neighbouring directions; NaN stays NaN.
 
-    A nick in an edge makes one direction a little narrower than the direction across the gap.
+    Without smoothing, a nick in an edge makes some direction narrower than the one across the gap.
     """
     turns = np.stack([np.roll(width, shift) for shift in range(-SMOOTHED, SMOOTHED + 1)])
     known = np.isfinite(turns)

@@ -1,4 +1,4 @@
-"""Parameters of the gap's edges, with meaning, default and range in one place."""
+"""Parameters of the detection and tracking of the gap's edges."""
 
 from dataclasses import dataclass, field
 from math import nan
@@ -10,7 +10,7 @@ from knee_gap_perception.segmentation.choice import STRATEGIES
 
 @dataclass(frozen=True)
 class EdgeParameters:
-    """How the gap is found and its two points are chosen and followed.
+    """Parameters of the detection of the gap and of the selection and tracking of its two points.
 
     Raises PerceptionError for values outside their range.
     """
@@ -20,7 +20,7 @@ class EdgeParameters:
         metadata={"description": "How the dark gap is told from tissue", "choices": tuple(STRATEGIES)},
     )
     network_path: str = field(
-        default="", metadata={"description": "ONNX file of the segmentation 'onnx': picture in, gap out"}
+        default="", metadata={"description": "ONNX file for the segmentation 'onnx': image in, gap out"}
     )
     network_input_size: tuple[int, ...] = field(
         default=(256, 256),
@@ -29,28 +29,28 @@ class EdgeParameters:
     network_mean: tuple[float, ...] = field(
         default=(0.0, 0.0, 0.0),
         metadata={
-            "description": "Taken from red, green, blue before the network",
+            "description": "Subtracted from red, green, blue before the network",
             "range": (-1000.0, 1000.0),
         },
     )
     network_scale: tuple[float, ...] = field(
         default=(1 / 255, 1 / 255, 1 / 255),
-        metadata={"description": "Then multiplied to red, green, blue", "range": (0.0, 1000.0)},
+        metadata={"description": "Multiplied with red, green, blue after that", "range": (0.0, 1000.0)},
     )
     working_rows: int = field(
-        default=180, metadata={"description": "Rows at which the gap is segmented [px]", "range": (90, 2160)}
+        default=180, metadata={"description": "Image rows of the segmentation [px]", "range": (90, 2160)}
     )
     region_centre: tuple[float, ...] = field(
         default=(nan, nan),
         metadata={
-            "description": "Column and row of the region of the section [px]; NaN: the field's centre",
+            "description": "Column and row of the region of interest's centre [px]; NaN: the field's centre",
             "range": (0.0, 16384.0),
             "nan": True,
         },
     )
     region_radius: float = field(
         default=0.55,
-        metadata={"description": "Radius of that region, against the field of view's", "range": (0.02, 2.0)},
+        metadata={"description": "Its radius relative to the field of view's [-]", "range": (0.02, 2.0)},
     )
     inset: float = field(
         default=0.035,
@@ -62,28 +62,28 @@ class EdgeParameters:
     minimum_confidence: float = field(
         default=0.4,
         metadata={
-            "description": "Confidence that a dark part is a gap, below which it is taken for shade [-]",
+            "description": "Least confidence of a gap [-]; a dark part with less counts as shade",
             "range": (0.0, 1.0),
         },
     )
     minimum_width: float = field(
         default=0.08,
         metadata={
-            "description": "Angle across the gap below which it is no gap [rad]",
+            "description": "Least angle across a gap [rad]",
             "range": (0.001, 1.0),
         },
     )
     field_margin: float = field(
         default=0.03,
         metadata={
-            "description": "Part of the field's radius at its rim in which nothing is looked for [-]",
+            "description": "Width of the ignored rim of the field, relative to its radius [-]",
             "range": (0.0, 0.5),
         },
     )
     error_factor: float = field(
         default=3.0,
         metadata={
-            "description": "angular_error in standard deviations along the worse direction [-]",
+            "description": "Standard deviations, along the worst direction, that make angular_error [-]",
             "range": (1.0, 10.0),
         },
     )
@@ -97,28 +97,28 @@ class EdgeParameters:
     maximum_unseen: float = field(
         default=0.7,
         metadata={
-            "description": "Time for which a hidden point is carried on before the track ends [s]",
+            "description": "Time for which a hidden point is predicted before the track ends [s]",
             "range": (0.0, 10.0),
         },
     )
     profile_period: float = field(
         default=0.2,
         metadata={
-            "description": "Time between two looks at more sections along the opening [s]",
+            "description": "Time between two searches for more sections along the opening [s]",
             "range": (0.0, 60.0),
         },
     )
     instrument_diameter: float = field(
         default=0.0,
         metadata={
-            "description": "Diameter of the instrument that the overlay draws in the opening; 0: none [m]",
+            "description": "Diameter of the instrument drawn by the overlay in the opening [m]; 0: none",
             "range": (0.0, 0.02),
         },
     )
     frozen_images: int = field(
         default=3,
         metadata={
-            "description": "Identical images in a row from which the video counts as frozen [-]",
+            "description": "Number of identical images in a row after which the video counts as frozen [-]",
             "range": (2, 1000),
         },
     )

@@ -1,4 +1,4 @@
-"""The search for the gap in one picture: segmentation, section, and the decision whether it is a gap."""
+"""Gap detector for one image: segmentation, section, and the decision whether it is a gap."""
 
 from typing import NamedTuple
 
@@ -16,13 +16,13 @@ from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 from knee_gap_perception.image.instruments_and_glare import foreign_bodies
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 
-DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field, below which nothing can be told
+DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the image is too dark
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
 OVEREXPOSED_SHARE = 0.7  # of the field
 
 
 class NoPointsError(Exception):
-    """Why an image gives no points: a status, and the reason in words."""
+    """No points in an image: the status, and the reason in words."""
 
     def __init__(self, status: EdgeStatus, reason: str) -> None:
         super().__init__(reason)
@@ -30,7 +30,7 @@ class NoPointsError(Exception):
 
 
 class Found(NamedTuple):
-    """A section; where the picture, made smaller by `scale`, shows what is no tissue: `foreign` (h, w)."""
+    """A section, and instruments and glare, `foreign` (h, w), in the image reduced by `scale`."""
 
     section: Section
     foreign: Mask
@@ -38,24 +38,24 @@ class Found(NamedTuple):
 
 
 class GapSearch:
-    """Finds the gap in pictures of one scope.
+    """Finds the gap in images of one scope.
 
-    `confidence` [0, 1] is that of the last search that its dark part is a gap; NaN where it found none.
+    `confidence` [0, 1] is that of the dark part found last; NaN if none was found.
     """
 
     def __init__(self, parameters: EdgeParameters) -> None:
-        """Raises PerceptionError where the segmentation cannot be had (a network that cannot be read)."""
+        """Raises PerceptionError if the segmentation cannot be loaded (an unreadable network, say)."""
         self.parameters = parameters
         self.confidence = float("nan")
         self._segmentation = segmentation_named(parameters.segmentation, **_settings(parameters))
         self._evidence = ConfidenceFilter()
 
     def forget(self) -> None:
-        """As if no picture had been searched."""
+        """Forget all images."""
         self._evidence.forget()
 
     def mask(self, picture: Image, field: FieldOfView) -> Image:
-        """Gap of a picture (h, w, 3): 255 where it is (h, w)."""
+        """Mask (h, w) of the gap in an image (h, w, 3): 255 in the gap, 0 elsewhere."""
         small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
         dark = self._segmentation(small, inside & ~foreign_bodies(small))
@@ -64,14 +64,14 @@ class GapSearch:
         return np.where(full > 127, 255, 0).astype(np.uint8)
 
     def foreign(self, picture: Image) -> tuple[Mask, float]:
-        """Instruments and glare (h, w) in a picture made smaller, and its scale against the full one."""
+        """Instruments and glare (h, w) in the reduced image, and its scale relative to the full image."""
         small, scale = self._smaller(picture)
         return foreign_bodies(small), scale
 
     def agreed_section(
         self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None
     ) -> Found:
-        """As `section`, if the images just before that of a stamp [ns] do not speak against it."""
+        """As `section`, unless the images just before that of a stamp [ns] contradict it."""
         try:
             found = self.section(picture, camera, field, clicked)
         except NoPointsError as refusal:
@@ -82,15 +82,15 @@ class GapSearch:
         if confidence < self.parameters.minimum_confidence:
             raise NoPointsError(
                 EdgeStatus.NO_GAP,
-                f"the images just before showed no gap: the confidence of all is {confidence:.2f}, needed is "
+                f"no gap in the images just before: their joint confidence is {confidence:.2f}, needed is "
                 f"{self.parameters.minimum_confidence:.2f}",
             )
         return found
 
     def section(self, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None) -> Found:
-        """The section of the gap in a picture (h, w, 3), or of the one at a clicked pixel (2,).
+        """Section of the gap in an image (h, w, 3), or of the gap at a clicked pixel (2,).
 
-        Raises NoPointsError where the picture shows none.
+        Raises NoPointsError if there is none.
         """
         self.confidence = float("nan")
         small, scale = self._smaller(picture)
@@ -110,7 +110,7 @@ class GapSearch:
         if not width >= self.parameters.minimum_width:
             raise NoPointsError(
                 EdgeStatus.NO_GAP,
-                f"the dark part is {np.degrees(width):.1f} deg wide, a gap at least "
+                f"the dark part is {np.degrees(width):.1f} deg wide, a gap is at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
         confidence = self.confidence = gap_confidence(section, field.extent, light, small, dark)
@@ -123,7 +123,7 @@ class GapSearch:
         return Found(section, foreign, scale)
 
     def _smaller(self, picture: Image) -> tuple[Image, float]:
-        """A picture (h, w, 3) at working size, and its scale against the full one."""
+        """An image (h, w, 3) at working size, and its scale relative to the full image."""
         scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
         size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
         return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8), scale
@@ -138,15 +138,15 @@ class GapSearch:
 
 
 def check_light(values: Image) -> float:
-    """Brightness [grey levels] that a twentieth of some values exceeds.
+    """Brightness [grey levels] that a twentieth of the values exceeds.
 
-    Raises NoPointsError where nothing can be told in that light.
+    Raises NoPointsError if the image is too dark or overexposed.
     """
     light = float(np.percentile(values, 95)) if values.size else 0.0
     if light < DARK_PICTURE:
-        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is too dark")
+        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the image is too dark")
     if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
-        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the picture is overexposed")
+        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the image is overexposed")
     return light
 
 

@@ -1,8 +1,8 @@
-"""The edges of the opening in the present image, at the section where an instrument would pass.
+"""Measurement of the opening's edges in the present image, at the section where an instrument would pass.
 
-The tracked points are the same in all images; the edges are not. Each image shows where tissue ends beside
-the points, and the largest circle between those borders, around a centre on the line across the opening, says
-how wide the opening looks: tissue beside that line counts as far as an instrument of that width reaches.
+The tracked points are the same in all images; the edges are not. In each image, the borders of the tissue
+beside the points are measured. The largest circle between them, centred on the line across the opening, gives
+the apparent width: tissue beside that line counts as far as an instrument of that width reaches.
 """
 
 from dataclasses import dataclass
@@ -16,34 +16,34 @@ from knee_gap_core.values.edges import EdgeState, SectionEdges
 from knee_gap_perception.camera.models import Camera, bearing_jacobian
 from knee_gap_perception.image.field_of_view import FieldOfView
 
-ROW_STEP = 4.0  # [px] along the opening between the lines on which its borders are looked for
-BEYOND = 24  # [px] beyond a tracked point to which its border may lie
-# Share of the way from the gap's brightness to the tissue's at which tissue begins. Light grazes a smooth
-# bone beside its contour, so tissue is dim there: half of the way would place the border inside the tissue.
+ROW_STEP = 4.0  # [px] along the opening between the lines on which its borders are searched
+BEYOND = 24  # [px] beyond a tracked point up to which its border is searched
+# Threshold where tissue begins, as a fraction of the way from the gap's brightness to the tissue's. Light
+# grazes smooth bone beside its contour, so tissue is dim there: one half would place the border inside it.
 TISSUE_BEGINS = 0.25
-# The same shares for where tissue begins at the earliest and at the latest.
+# The same fractions for the earliest and the latest beginning of tissue.
 EARLIEST, LATEST = 0.12, 0.5
-LEAST_STEP = 10.0  # [grey levels] from gap to tissue, below which no border can be placed
-SLOWEST_TURN = np.radians(4.0)  # by which the direction across may turn from an image to the next
-TURN_SHARE = 0.3  # of the difference that it turns
-JUMP = 8.0  # [px] that an edge may move against its point from an image to the next
-JUMP_RATE = 60.0  # [px/s] by which that grows while the edge is not seen
-HELD = 0.5  # [s] after which an edge that stays elsewhere is believed
-FLOOR = 1.0  # [px] standard deviation of an edge that is perfectly sharp
-WIDTH_SHARE = 0.3  # of the width of a border, that its place is uncertain by
+LEAST_STEP = 10.0  # [grey levels] least step from gap to tissue at a border
+SLOWEST_TURN = np.radians(4.0)  # largest rotation of the direction across from one image to the next
+TURN_SHARE = 0.3  # fraction of the difference by which it rotates
+JUMP = 8.0  # [px] largest motion of an edge relative to its point from one image to the next
+JUMP_RATE = 60.0  # [px/s] growth of that limit while the edge is not visible
+HELD = 0.5  # [s] after which an edge that stays at another position is accepted
+FLOOR = 1.0  # [px] standard deviation of a perfectly sharp edge
+WIDTH_SHARE = 0.3  # standard deviation of an edge relative to the width of its border
 BOUND = 3.0  # standard deviations
-MARGIN = 3.0  # [px] from the border of the field of view within which an edge counts as lying at it
-FOREIGN_SHARE = 0.3  # of the lines of an instrument's width that may be covered
-COARSE = 40  # steps in which the centre of the largest circle is looked for, three times finer and finer
+MARGIN = 3.0  # [px] from the border of the field of view, within which an edge counts as at the border
+FOREIGN_SHARE = 0.3  # largest covered fraction of the lines of an instrument's width
+COARSE = 40  # steps of the search for the centre of the largest circle, refined three times
 STATIONS = 3  # sections to either side in a profile
 STATION_STEP = 0.6  # of the circle's radius between two of them
 
 
 class Borders(NamedTuple):
-    """Where tissue begins on lines across the opening, to one side: distances (n,) from the centre [px].
+    """Border of the tissue on lines across the opening, on one side: distances (n,) from the centre [px].
 
-    `earliest` and `latest` (n,) enclose `place`. `known` is false for a line whose border is not seen:
-    covered, or beyond where it was looked for; the border then lies at `place` or farther out.
+    `earliest` and `latest` (n,) enclose `place`. `known` is false for a line whose border is not visible,
+    because it is covered or outside the search range; the border then lies at `place` or farther out.
     """
 
     place: Array
@@ -53,7 +53,7 @@ class Borders(NamedTuple):
 
 
 class Circle(NamedTuple):
-    """The largest circle around a place on a line: offset of its centre along the line and radius [px].
+    """Largest circle with its centre on a line: offset of the centre along the line, and radius [px].
 
     `contacts` (2,): the lines on which it touches either border.
     """
@@ -66,8 +66,8 @@ class Circle(NamedTuple):
 def largest_circle(rows: Array, borders: tuple[Array, Array], at: float = 0.0) -> Circle:
     """The largest circle with its centre on the line at `at`, between borders (n,) on lines at `rows` (n,).
 
-    Borders are distances from the line through the section's centre, to the one side and to the other, both
-    positive outwards; all lengths in pixels.
+    Borders are distances from the line through the section's centre to either side, both positive outwards;
+    all lengths in pixels.
     """
     reach = float(min(borders[0].max(), borders[1].max()))
     offset = 0.0
@@ -100,10 +100,10 @@ class _Strip:
 
 
 class SectionEdgeFinder:
-    """Finds the edges beside two tracked points in one image after the other."""
+    """Measures the edges beside two tracked points, image by image."""
 
     def __init__(self, centre: Array, across: Array, points: Array) -> None:
-        """Begin at the section around `centre` (2,) [px], across along a unit vector (2,).
+        """Start at the section around `centre` (2,) [px], with the unit vector (2,) across the opening.
 
         `points` (2, 2) [px] are the tracked points beside it, in the same image.
         """
@@ -132,8 +132,8 @@ class SectionEdgeFinder:
     ) -> tuple[SectionEdges, tuple[SectionEdges, ...]]:
         """The edges at the section, and those at more sections along the opening if `profile`.
 
-        `grey` (h, w) is the image exposed at a stamp [ns]; `foreign` the picture, made smaller by `scale`,
-        where it shows instruments or glare; `points` (2, 2) [px] the tracked points in it.
+        `grey` (h, w) is the image exposed at a stamp [ns]; `foreign` the mask of instruments and glare,
+        reduced by `scale`; `points` (2, 2) [px] the tracked points in the image.
         """
         edges: SectionEdges = SectionEdges()
         more: tuple[SectionEdges, ...] = ()
@@ -159,13 +159,13 @@ class SectionEdgeFinder:
         return edges, more
 
     def _centre(self, points: Array) -> Array:
-        """Where the section's centre is now (2,) [px]: it keeps its place between the points."""
+        """Present centre of the section (2,) [px]: it keeps its position between the points."""
         along = np.array([-self._across[1], self._across[0]])
         grown = float(np.linalg.norm(points[1] - points[0])) / max(self._span, 1.0)
         shift = self._shift * float(np.clip(grown, 0.3, 3.0))
         centre = points.mean(axis=0) + shift * along + self._offset * self._across
         if self._circle is not None and self._insets is not None:
-            # Midway between the edges, where they were against their points in the last image.
+            # Midway between the edges, at their offsets from the points in the last image.
             across = (points - centre) @ self._across + np.array([1.0, -1.0]) * self._insets
             centre = centre + across.mean() * self._across
         return np.asarray(centre)
@@ -173,7 +173,7 @@ class SectionEdgeFinder:
     def _borders(
         self, grey: Image, foreign: Mask, scale: float, centre: Array, points: Array, profile: bool
     ) -> tuple[Array, tuple[Borders, Borders]] | None:
-        """Lines (n,) along the opening and the borders on either side; None where none can be placed."""
+        """Lines (n,) along the opening and the borders on either side; None if none can be measured."""
         reaches = np.abs((points - centre) @ self._across) + BEYOND
         if not (np.isfinite(reaches).all() and reaches.max() < 2000.0):
             return None
@@ -225,7 +225,7 @@ class SectionEdgeFinder:
         return float(np.median(strip.values[rows, strip.middle - reach : strip.middle + reach + 1]))
 
     def _turn(self, circle: Circle, rows: Array, borders: tuple[Borders, Borders], share: float) -> None:
-        """Turn the direction across towards the line between the circle's two contacts."""
+        """Rotate the direction across towards the line between the circle's two contacts."""
         first, second = circle.contacts
         apart = np.array(
             [borders[0].place[first] + borders[1].place[second], rows[second] - rows[first]], float
@@ -278,14 +278,14 @@ class SectionEdgeFinder:
         )
 
     def _insets_of(self, circle: Circle, points: Array, centre: Array) -> Array:
-        """How far (2,) [px] each tracked point lies beyond its edge, across the opening."""
+        """Distance (2,) [px] of each tracked point beyond its edge, across the opening."""
         places = (points - centre) @ self._across
         return np.array(
             [circle.offset - circle.radius - places[0], places[1] - circle.offset - circle.radius]
         )
 
     def _plausible(self, stamp_ns: int, insets: Array) -> bool:
-        """Whether the edges are where those of the last image lead one to expect them."""
+        """Whether the edges are close to those expected from the last image."""
         if self._insets is None:
             return True
         since = 1e-9 * (stamp_ns - self._seen_ns)
@@ -318,7 +318,7 @@ def _tissue_level(grey: Image, pixel: Array) -> float:
 def _last_below(lines: Array, threshold: float) -> Array:
     """Distance (n,) [px] along each line (n, m) of the last crossing of a threshold, from dark to bright.
 
-    0 where a line is bright from its start, its length where it ends dark.
+    0 if a line is bright from its start, its length if it ends dark.
     """
     dark = lines <= threshold
     count = lines.shape[1]

@@ -1,4 +1,4 @@
-"""The disc of the image in which the scope shows anything, found in the image itself."""
+"""Detection of the field of view: the disc of the image that the scope fills."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,19 @@ from knee_gap_core.values.arrays import Array, Mask
 
 Brightness = npt.NDArray[np.uint8]
 
-WORKING_ROWS = 180  # rows at which the disc is looked for
+WORKING_ROWS = 180  # image rows at which the disc is searched
 HYPOTHESES = 400  # circles through three boundary points
 INLIER_DISTANCE = 1.2  # [px at working size]
 STRAIGHT_SHARE = 0.25  # of a side's rows or columns; a disc's own extreme has less within a pixel
-MINIMUM_ARC = np.radians(90)  # boundary that must be seen for a circle to be believed
+MINIMUM_ARC = np.radians(90)  # visible boundary needed to accept a circle
 
 
 @dataclass(frozen=True)
 class FieldOfView:
     """A disc (centre column and row, radius [px]) cut by the box of the picture.
 
-    `box` is first column, first row, last column, last row [px]. A scope that fills the frame has no disc:
-    its radius is infinite and the box alone counts.
+    `box` is first column, first row, last column, last row [px]. If the picture fills the frame, there is no
+    disc: the radius is infinite and only the box counts.
     """
 
     centre: tuple[float, float]
@@ -31,7 +31,7 @@ class FieldOfView:
 
     @property
     def extent(self) -> float:
-        """Radius [px] of the disc, or of the largest disc in the box where there is none."""
+        """Radius [px] of the disc, or of the largest disc in the box if there is none."""
         x0, y0, x1, y1 = self.box
         return min(self.radius, (x1 - x0) / 2, (y1 - y0) / 2) if np.isinf(self.radius) else self.radius
 
@@ -53,7 +53,7 @@ class FieldOfView:
         x = (np.arange(shape[1])[None, :] + 0.5) / scale - 0.5
         x0, y0, x1, y1 = self.box
         inside = (np.minimum(y - y0, y1 - y) > margin) & (np.minimum(x - x0, x1 - x) > margin)
-        # As depth_inside, but without a root for each pixel.
+        # Like depth_inside, but without a square root for each pixel.
         reach = max(self.radius - margin, 0.0)
         disc = (x - self.centre[0]) ** 2 + (y - self.centre[1]) ** 2 < reach**2
         return np.asarray(inside & disc)
@@ -66,7 +66,7 @@ def brightness(image: Brightness) -> Brightness:
 
 
 def find_field_of_view(image: npt.NDArray[np.uint8]) -> FieldOfView | None:
-    """The field of view in an image (h, w, 3); None where the image is too dark to tell."""
+    """The field of view in an image (h, w, 3); None if the image is too dark."""
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_ROWS / min(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -85,7 +85,7 @@ def find_field_of_view(image: npt.NDArray[np.uint8]) -> FieldOfView | None:
         centre = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
         return FieldOfView(centre, float("inf"), box) if corners_bright or _fills(picture) else None
     x, y, radius = circle
-    # Only a straight side cuts the disc; where the picture merely ends early, the gap reaches the rim.
+    # Only a straight side cuts the disc; if the picture just ends early, the gap reaches the rim.
     sides = [-0.5, -0.5, size[0] - 0.5, size[1] - 0.5]
     sides = [
         cut if cuts else frame for cut, cuts, frame in zip(_sides(picture), straight, sides, strict=True)
@@ -102,7 +102,7 @@ def _corners(small: Brightness) -> npt.NDArray[np.float64]:
 
 
 def _picture_threshold(small: Brightness) -> float | None:
-    """Brightness that tells picture from surround; None where there is no picture."""
+    """Brightness threshold between picture and surround; None if there is no picture."""
     dark = float(_corners(small).min())
     bright = float(np.percentile(small, 95))
     if bright - min(dark, 24.0) < 16:
@@ -124,14 +124,14 @@ def _largest_part(picture: Mask) -> Mask:
 
 
 def _fills(picture: Mask) -> bool:
-    """Whether the picture's bounding box is filled: a picture without a disc."""
+    """Whether the picture fills its bounding box: a picture without a disc."""
     rows, columns = np.flatnonzero(picture.any(axis=1)), np.flatnonzero(picture.any(axis=0))
     inside = picture[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     return bool(_corners(inside.astype(np.uint8)).sum() >= 3)
 
 
 def _sides(picture: Mask) -> list[float]:
-    """Left, top, right and bottom side of the picture; rows or columns of dust do not count."""
+    """Left, top, right and bottom side of the picture; rows or columns of isolated pixels do not count."""
     columns = np.flatnonzero(picture.sum(axis=0) >= 2)
     rows = np.flatnonzero(picture.sum(axis=1) >= 2)
     return [columns[0] - 0.5, rows[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5]
@@ -175,7 +175,7 @@ def _boundary(picture: Mask) -> tuple[Array, list[bool]]:
 
 
 def _fit_circle(points: Array) -> tuple[float, float, float] | None:
-    """Centre and radius of the circle on which most points lie; None where no circle explains them."""
+    """Centre and radius of the circle on which most points lie; None if no circle fits them."""
     if len(points) < 40:
         return None
     triples = np.random.default_rng(0).integers(0, len(points), (HYPOTHESES, 3))
@@ -230,16 +230,14 @@ def _least_squares_circle(points: Array) -> Array:
 
 
 class FieldOfViewFinder:
-    """The field of view of a stream: found once, found anew when the picture no longer fits it."""
+    """The field of view of a stream of images: found once, and again if the picture no longer fits it."""
 
-    RETRY_EVERY = 30  # images after which a frame without a disc is looked at again
+    RETRY_EVERY = 30  # images between attempts if there is no disc
     REFRESH_EVERY = (
-        120  # images after which a disc is found anew: the camera turns and shifts on the eyepiece
+        120  # images after which the disc is searched again: the camera rotates and shifts on the eyepiece
     )
-    CHECK_EVERY = (
-        4  # images, of which one is looked at for picture where there should be none, and the reverse
-    )
-    MISFITS = 3  # of these in a row, after which the disc is found anew
+    CHECK_EVERY = 4  # images between checks for picture outside the disc, and for none along its rim
+    MISFITS = 3  # failed checks in a row after which the disc is searched again
 
     def __init__(self) -> None:
         self._field: FieldOfView | None = None
@@ -248,7 +246,7 @@ class FieldOfViewFinder:
         self._misfits = 0
 
     def find(self, image: npt.NDArray[np.uint8]) -> FieldOfView | None:
-        """The field of view of the stream's next image (h, w, 3); None while no image was bright enough."""
+        """The field of view of the stream's next image (h, w, 3); None until an image is bright enough."""
         if image.shape != self._shape:
             self._field, self._shape, self._age, self._misfits = None, image.shape, -1, 0
         self._age += 1
@@ -266,7 +264,7 @@ class FieldOfViewFinder:
         return self._field
 
     def _misfit(self, image: npt.NDArray[np.uint8]) -> bool:
-        """Whether a coarse grid of pixels shows picture well outside the disc, or none along its rim."""
+        """Whether there is picture well outside the disc, or none along its rim, on a coarse grid."""
         assert self._field is not None
         step = max(1, min(image.shape[:2]) // 40)
         grid = image[step // 2 :: step, step // 2 :: step].max(axis=2)

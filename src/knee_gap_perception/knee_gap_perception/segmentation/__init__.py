@@ -1,1 +1,1 @@
-"""Which pixels are the dark gap: strategies behind one Protocol, chosen by name."""
+"""Segmentation of the dark gap: strategies with one interface, chosen by name."""

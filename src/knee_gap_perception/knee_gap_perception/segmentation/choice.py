@@ -43,9 +43,9 @@ WITHOUT_NETWORK = tuple(name for name, strategy in STRATEGIES.items() if not str
 
 
 def segmentation_named(name: str, **settings: Any) -> Segmentation:
-    """The strategy of a name in STRATEGIES, with the settings of its class.
+    """Return the strategy of a name in STRATEGIES, with the settings of its class.
 
-    Raises PerceptionError for an unknown name and for what the strategy itself refuses.
+    Raises PerceptionError for an unknown name and for settings that the strategy refuses.
     """
     if name not in STRATEGIES:
         raise PerceptionError(f"segmentation must be one of {', '.join(STRATEGIES)}, not '{name}'")

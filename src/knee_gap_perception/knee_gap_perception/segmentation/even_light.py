@@ -1,8 +1,8 @@
-"""The fall of light towards the rim of the picture, taken out of its brightness.
+"""Correction of vignetting: the fall-off of light towards the rim of the image.
 
 Lens and lamp lose light towards the rim: tissue there is as dark as the middle of a gap that a veil of fluid
-lights up. The loss is taken to grow with the square of the distance from the field's middle, in the logarithm
-of brightness, and its strength to be that which parts the picture into three classes most clearly.
+lights up. The model: the logarithm of brightness falls with the square of the distance from the field's
+middle. The strength is the one that separates the image into three classes most clearly.
 """
 
 from typing import NamedTuple
@@ -14,13 +14,13 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.segmentation.three_classes import otsu3
 
-LOG_OFFSET = 12.0  # [grey levels]: the noise of a black gap makes no class of its own
-COARSE = 4  # levels taken as one where strengths are compared
-STRENGTHS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)  # [levels] lost between middle and rim
+LOG_OFFSET = 12.0  # [grey levels]: so that the noise of a black gap does not become a class
+COARSE = 4  # levels per bin in the comparison of strengths
+STRENGTHS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)  # [levels] loss between middle and rim
 
 
 class EvenLight(NamedTuple):
-    """Brightness (h, w) with the loss taken out, [0, 255], and the last values of its two darker classes."""
+    """Corrected brightness (h, w), [0, 255], and the last values of its two darker classes."""
 
     level: npt.NDArray[np.uint8]
     dark: float
@@ -30,7 +30,7 @@ class EvenLight(NamedTuple):
 def log_levels(image: Image, offset: float = LOG_OFFSET) -> npt.NDArray[np.float32]:
     """Logarithm of the mean of the channels of an image (h, w, 3), scaled to [0, 255] (h, w).
 
-    The larger the offset [grey levels], the more it is like brightness itself.
+    The larger the offset [grey levels], the closer it is to brightness itself.
     """
     curve = np.log1p(np.arange(256) / offset).astype(np.float32)
     mean = cv2.transform(image, np.full((1, 3), 1 / 3))
@@ -38,10 +38,10 @@ def log_levels(image: Image, offset: float = LOG_OFFSET) -> npt.NDArray[np.float
 
 
 def even_light(image: Image, field: Mask) -> EvenLight:
-    """Brightness of an image (h, w, 3), evened and classed within a field (h, w), which is not empty."""
+    """Corrected and classified brightness of an image (h, w, 3) within a field (h, w), which is not empty."""
     level, away = log_levels(image), _square_of_distance(field)
     inside, distance = level[field], away[field] - 0.5
-    # Which strength is best can be told from fewer levels, at a fraction of the cost.
+    # The strengths are compared on fewer levels, at a fraction of the cost.
     clearness = [
         otsu3((np.clip(inside + strength * distance, 0.0, 255.0) / COARSE).astype(np.uint8), 256 // COARSE)[2]
         for strength in STRENGTHS

@@ -1,4 +1,4 @@
-"""Segmentation by a network that a laboratory has trained, run by OpenCV."""
+"""Segmentation by a neural network of the laboratory (ONNX), run by OpenCV."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ from knee_gap_perception.errors import PerceptionError
 
 
 class Network:
-    """An ONNX network from a picture (1, 3, height, width) to the gap (1, classes, height, width).
+    """An ONNX network from an image (1, 3, height, width) to the gap (1, classes, height, width).
 
-    With one output channel a value above `threshold` is the gap; with several, the gap is where channel
-    `gap_channel` is the largest. The input is (picture - mean) * scale per channel, in red, green, blue.
+    With one output channel, a value above `threshold` is the gap. With several, the gap is where channel
+    `gap_channel` is the largest. The input is (image - mean) * scale per channel, in red, green, blue.
 
-    Raises PerceptionError for a file that is missing or that OpenCV cannot read, and for outputs of another
+    Raises PerceptionError if the file is missing, if OpenCV cannot read it, or if the output has another
     shape.
     """
 
@@ -32,7 +32,7 @@ class Network:
     ) -> None:
         """`input_size` is width and height [px]; `mean` and `scale` are of red, green, blue."""
         if not Path(path).is_file():
-            raise PerceptionError(f"network_path must be an ONNX file, but '{path}' is none")
+            raise PerceptionError(f"network_path must be an ONNX file; '{path}' is not a file")
         try:
             self._net = cv2.dnn.readNetFromONNX(path)
         except cv2.error as error:

@@ -1,4 +1,4 @@
-"""What a segmentation strategy is."""
+"""Interface of a segmentation strategy."""
 
 from typing import Protocol
 
@@ -6,11 +6,11 @@ from knee_gap_core.values.arrays import Image, Mask
 
 
 class Segmentation(Protocol):
-    """Tells which pixels of an image are dark as the gap is.
+    """Segments the pixels of an image that are as dark as the gap.
 
     The image (h, w, 3) is blue, green, red, at working size; `field` (h, w) is the part of it that shows
     tissue: inside the field of view, without glare and instruments. Returns the dark pixels (h, w), a
-    subset of `field`. Nothing is decided here about which of them are a gap.
+    subset of `field`. Which of them are a gap is decided elsewhere.
     """
 
     def __call__(self, image: Image, field: Mask) -> Mask:

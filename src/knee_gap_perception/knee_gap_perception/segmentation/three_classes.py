@@ -1,6 +1,6 @@
-"""Otsu's thresholds for three classes (Otsu 1979, section 4): all pairs are compared.
+"""Otsu's thresholds for three classes (Otsu 1979, section 4), by comparison of all pairs.
 
-scikit-image has the same; to load it takes longer than a node may take to start.
+scikit-image has the same function, but takes too long to load at the start of a node.
 """
 
 from functools import cache
@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 
 class ThreeClasses(NamedTuple):
-    """The last value of the dark and of the middle class, and how clearly the classes are parted.
+    """Last values of the dark and of the middle class, and the separation of the classes.
 
-    `clearness` is the variance between the classes against the whole, [0, 1].
+    `clearness` is the variance between the classes divided by the total variance, [0, 1].
     """
 
     dark: float
@@ -23,20 +23,20 @@ class ThreeClasses(NamedTuple):
 
 @cache
 def _in_order(levels: int) -> npt.NDArray[np.bool_]:
-    """Pairs (levels, levels) of which the second is the larger."""
+    """Mask (levels, levels) of the pairs whose second level is the larger."""
     return np.triu(np.ones((levels, levels), dtype=bool), 1)
 
 
 def otsu3(values: npt.NDArray[np.uint8], levels: int = 256) -> ThreeClasses:
-    """Classes of values (n,) below `levels`, of which there is at least one."""
+    """Classes of values (n,) below `levels`; n is at least one."""
     counts = np.bincount(values, minlength=levels).astype(np.float64)
     present = np.flatnonzero(counts)
     if len(present) < 3:
         return ThreeClasses(float(present[0]), float(present[0]), 1.0 if len(present) == 2 else 0.0)
     mass = np.concatenate([[0.0], np.cumsum(counts)])
     moment = np.concatenate([[0.0], np.cumsum(counts * np.arange(levels))])
-    # The variance between the classes is, but for a constant, the sum of moment^2 / mass of each: table[i, j]
-    # is that of the class of levels i to j - 1.
+    # The variance between the classes is, apart from a constant, the sum of moment^2 / mass of each class:
+    # table[i, j] is that of the class of levels i to j - 1.
     width = mass[None, :] - mass[:, None]
     table = np.divide(
         (moment[None, :] - moment[:, None]) ** 2, width, out=np.zeros_like(width), where=width > 0

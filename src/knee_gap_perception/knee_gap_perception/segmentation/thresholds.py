@@ -1,4 +1,4 @@
-"""Segmentation by brightness thresholds: the paper's Otsu, Otsu with three classes, and an adaptive one."""
+"""Segmentation by brightness thresholds: Otsu (the paper's), Otsu with three classes, and adaptive."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ def otsu_threshold(values: npt.NDArray[np.uint8]) -> float:
 
 
 class Otsu:
-    """The paper's: Otsu's threshold on the green channel, inside the field of view."""
+    """The paper's method: Otsu's threshold on the green channel, inside the field of view."""
 
     def __call__(self, image: Image, field: Mask) -> Mask:
         """Dark pixels (h, w) of an image (h, w, 3) within `field` (h, w)."""
@@ -27,11 +27,12 @@ class Otsu:
 
 
 class Otsu3:
-    """Three classes on the logarithm of brightness, gap, shaded and lit tissue: only the darkest is the gap.
+    """Three classes of the logarithm of brightness: gap, shaded tissue and lit tissue.
 
     Light falls with the square of the distance and with the cosine of incidence, so the classes are even in
-    its logarithm; on brightness itself the shaded flank of a condyle goes to the gap. The mean of the three
-    channels is the same for a far wall that glows red and for a veil of fluid. The light is evened first.
+    its logarithm; with brightness itself, the shaded flank of a condyle is classified as gap. The mean of the
+    three channels is the same for a far wall that glows red and for a veil of fluid. Vignetting is corrected
+    first.
     """
 
     def __call__(self, image: Image, field: Mask) -> Mask:
@@ -43,13 +44,13 @@ class Otsu3:
 
 
 class Adaptive:
-    """Dark against the surroundings: below a share of the mean brightness within a wide window.
+    """Adaptive threshold: below a fraction of the mean brightness within a wide window.
 
-    The mean is taken over the field only, so that the black surround darkens nothing.
+    The mean is over the field only, so that the black surround does not lower it.
     """
 
     def __init__(self, window: float = 0.5, share: float = 0.5) -> None:
-        """`window`: side of the square against the image's rows; `share` of the mean below which is dark."""
+        """`window`: side of the square relative to the rows; `share`: threshold relative to the mean."""
         self._window, self._share = window, share
 
     def __call__(self, image: Image, field: Mask) -> Mask:

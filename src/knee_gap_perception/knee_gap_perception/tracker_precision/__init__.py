@@ -1,1 +1,1 @@
-"""Precision of a tracker, from a recording of a body."""
+"""The command `tracker_precision`: precision of a tracker from a recording of a body."""

@@ -1,4 +1,4 @@
-"""Tells the tracker's precision (DT and omega) from bags or takes: parameters to paste and a plot."""
+"""The command `tracker_precision`: DT and omega from bags or takes, as parameters to paste and a plot."""
 
 import argparse
 import logging
@@ -28,19 +28,19 @@ from knee_gap_perception.trackers.motive_csv import read_take
 
 _LOG = logging.getLogger(__name__)
 POSE_TYPES = ("geometry_msgs/msg/PoseStamped",)
-# The end of a gap is a sound pose; only what is no pose at all is left out.
+# The first pose after a gap is good; only invalid poses are left out.
 HARMLESS = {RefusalReason.GAP}
 
 
 def series_of(name: str, bodies: Iterable[BodyPose]) -> PoseSeries:
-    """Poses that are fit to be judged: tracked, finite, rising stamps.
+    """Usable poses: tracked, finite, with increasing stamps.
 
     Raises PerceptionError if there are none.
     """
     validity = PoseValidity(ValidityParameters(jump_hold=0.0))
     sound = [body for body in bodies if (fault := validity.check(body)) is None or fault.reason in HARMLESS]
     if not sound:
-        raise PerceptionError(f"{name}: no pose that is tracked and well-formed")
+        raise PerceptionError(f"{name}: no valid tracked pose")
     return PoseSeries(
         name=name,
         time=np.array([body.stamp_ns - sound[0].stamp_ns for body in sound]) / 1e9,
@@ -50,12 +50,12 @@ def series_of(name: str, bodies: Iterable[BodyPose]) -> PoseSeries:
 
 
 def read_bodies(path: Path, topic: str | None, body: str | None, up_axis: str) -> list[BodyPose]:
-    """Poses of a bag's topic or of a take's body. Raises PerceptionError where there are none."""
+    """Poses of a bag's topic or of a take's body. Raises PerceptionError if there are none."""
     if path.suffix.lower() == ".csv":
         take = read_take(path, up_axis=up_axis)
         if body is None and len(take.bodies) != 1:
             known = ", ".join(f"'{item.name}'" for item in take.bodies) or "none"
-            raise PerceptionError(f"{path.name}: say which rigid body with --body; the take has: {known}")
+            raise PerceptionError(f"{path.name}: name a rigid body with --body; the take has: {known}")
         name = take.body(body).name if body is not None else take.bodies[0].name
         return [pose for frame in take.frames(1) for pose in frame.bodies if pose.name == name]
     with opened(path) as reader:
@@ -70,7 +70,7 @@ def read_bodies(path: Path, topic: str | None, body: str | None, up_axis: str) -
 
 
 def _readable_poses(reader: BagReader, topic: str) -> Iterator[BodyPose]:
-    """Poses of a topic; one whose bytes are none is told in the log and left out."""
+    """Poses of a topic; a message that cannot be read is logged and skipped."""
     for entry in reader.messages([topic]):
         try:
             message = reader.deserialize(entry)
@@ -81,7 +81,7 @@ def _readable_poses(reader: BagReader, topic: str) -> Iterator[BodyPose]:
 
 
 def table(precisions: Sequence[Precision]) -> list[str]:
-    """Lines of a table: each recording, and all of them."""
+    """Lines of a table: one for each recording, and one for all."""
     position, rotation = pooled(precisions)
     lines = [
         f"{'':28} {'position (mm)':>22} {'rotation (deg)':>22} {'poses':>16}",
@@ -99,7 +99,7 @@ def table(precisions: Sequence[Precision]) -> list[str]:
 
 def parameters_yaml(position: ErrorSums, rotation: ErrorSums, point: str) -> str:
     """Parameters of tracking_node, the larger of the errors at rest and in motion."""
-    slow = "not known: nothing was at rest" if isnan(position.slow) else f"{position.slow * 1e3:.4f} mm"
+    slow = "unknown: no segment at rest" if isnan(position.slow) else f"{position.slow * 1e3:.4f} mm"
     moved = [_shown(value * 1e3, 4) for value in (position.rest.rms, position.motion)]
     turned = [_shown(degrees(value), 5) for value in (rotation.rest.rms, rotation.motion)]
     return (
@@ -119,7 +119,7 @@ def _shown(value: float, digits: int) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    # The plot's library takes a second to load; a mistake should be told before.
+    # The plot's library takes a second to load; mistakes in the arguments are reported before.
     precisions = []
     for path in arguments.recordings:
         bodies = read_bodies(path, arguments.topic, arguments.body, arguments.up_axis)
@@ -130,10 +130,10 @@ def _run(arguments: argparse.Namespace) -> None:
     position, rotation = pooled(precisions)
     print("\n".join(table(precisions)))
     if isnan(position.slow):
-        print("tracker_precision: nothing was at rest, so errors that change slowly are not in these numbers")
+        print("tracker_precision: no segment at rest, so slowly changing errors are not included")
     elif position.slow > 2.0 * position.rest_smooth.rms:
         print(
-            "tracker_precision: at rest most of the error is slow: was the body put down, or held in a hand?"
+            "tracker_precision: most of the error at rest is slow: was the body held in a hand? Put it down"
         )
     from knee_gap_perception.tracker_precision.plot import plot
 
@@ -149,7 +149,7 @@ def _parser() -> Parser:
     parser = Parser(prog="tracker_precision", description=__doc__)
     add = parser.add_argument
     add("recordings", nargs="+", type=Path, metavar="BAG", help="bags, or takes exported by Motive (.csv)")
-    add("--topic", help="of the poses (the one that ends in scope_body/pose)")
+    add("--topic", help="topic of the poses (the one that ends in scope_body/pose)")
     add("--body", help="rigid body of a take")
     add("--up-axis", choices=("y", "z"), default="y", help="axis that points up in a take (y)")
     add(
@@ -157,14 +157,14 @@ def _parser() -> Parser:
         nargs=3,
         type=finite,
         metavar=("X", "Y", "Z"),
-        help="place of the lens in the body [m] (body_to_shaft_translation): the error is told for the lens",
+        help="position of the lens in the body [m] (body_to_shaft_translation): report the errors there",
     )
     add("--out", type=Path, default=Path("out/tracker_precision"), help="folder for the YAML and the plot")
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Tell the precision; a mistake is one line."""
+    """Report the precision; return 0, or 1 after one line about a mistake."""
     arguments = _parser().parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="tracker_precision: %(message)s", stream=sys.stderr)
     try:

@@ -1,4 +1,4 @@
-"""The plot of the tracker's precision: where the body rested and moved, and each pose's error."""
+"""Plot of the tracker's precision: segments at rest and in motion, and each pose's error."""
 
 from collections.abc import Sequence
 from pathlib import Path

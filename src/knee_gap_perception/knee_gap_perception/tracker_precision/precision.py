@@ -1,18 +1,18 @@
-"""How precise the tracker is: DT and omega of a body, at rest and in motion (the paper's section II-F).
+"""Precision of a tracker: DT and omega of a body, at rest and in motion (the paper's section II-F).
 
-The paper gives RMS lengths of the error vectors of stationary and of moving markers and does not say how the
-error of a moving one was had without its true path. Here:
+The paper gives RMS lengths of the error vectors of stationary and of moving markers. It does not describe how
+the error of a moving marker was determined without its true path. Here:
 
-- **At rest** the error is the distance from the mean of the segment, with n - 1 degrees of freedom. A body at
-rest has been put down: held in a hand, its tremor would pass for the tracker's error. - **In motion** it is
-the distance from a smooth path: a cubic through the neighbouring poses. A pose pulls the path towards itself
-by its leverage h, so the sum of squares is divided by the sum of 1 - h. The length of the neighbourhood is
-the one that predicts left-out poses best: longer ones cannot follow the hand, shorter ones follow the noise.
-- A smooth path also follows errors that change slowly, which at rest are part of the error. What rest shows
-beyond its own smooth path is therefore added to the error in motion. Without a segment at rest it is not
-known.
+- **At rest**, the error is the distance from the mean of the segment, with n - 1 degrees of freedom. The body
+  must be put down: in a hand, the tremor would count as the tracker's error.
+- **In motion**, it is the distance from a smooth path: a cubic through the neighbouring poses. A pose pulls
+  the path towards itself by its leverage h, so the sum of squares is divided by the sum of 1 - h. The length
+  of the neighbourhood is the one that predicts left-out poses best: longer ones cannot follow the hand,
+  shorter ones follow the noise.
+- **Slow errors**: a smooth path also follows errors that change slowly, which are part of the error at rest.
+  Their part at rest is therefore added to the error in motion. Without a segment at rest, it is unknown.
 
-Errors that depend on the place in the room (calibration of the cameras) are in neither.
+Errors that depend on the position in the room (from the calibration of the cameras) are not included.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,8 +31,8 @@ from knee_gap_perception.errors import PerceptionError
 
 DEGREE = 3
 NEIGHBOURHOODS = (5, 7, 9, 11, 15, 21, 31, 45)
-# At rest, the mean place and direction change by less than this between the halves of a window [s], and of
-# the whole segment; or by no more than white noise of the size that is found explains.
+# At rest, the mean position and orientation change by less than this between the halves of a window [s] and
+# of the whole segment, or by no more than white noise of the measured size explains.
 REST_WINDOW = 0.5
 MOST_CHANGE = (0.125e-3, radians(0.025))
 MOST_CREEP = (0.05e-3, radians(0.01))
@@ -65,7 +65,7 @@ class PoseSeries:
 
 
 class ErrorSum(NamedTuple):
-    """Sum of squared error lengths over its degrees of freedom; sums add up over segments and recordings."""
+    """Sum of squared error lengths and its degrees of freedom, which add up over segments and recordings."""
 
     squares: float = 0.0
     freedom: float = 0.0
@@ -102,28 +102,28 @@ class ErrorSums:
 
     @property
     def slow(self) -> float:
-        """RMS of the part at rest that a smooth path follows; NaN where there was no rest."""
+        """RMS of the part at rest that a smooth path follows; NaN without a segment at rest."""
         excess = self.rest.rms**2 - self.rest_smooth.rms**2
         return sqrt(max(excess, 0.0)) if np.isfinite(excess) else nan
 
     @property
     def motion(self) -> float:
-        """RMS in motion, the slow part included where it is known; NaN without motion."""
+        """RMS in motion, including the slow part if it is known; NaN without motion."""
         slow = self.slow
         return sqrt(self.motion_smooth.rms**2 + (0.0 if np.isnan(slow) else slow**2))
 
     @property
     def worse(self) -> float:
-        """The larger of the errors at rest and in motion: what a measurement should reckon with."""
+        """The larger of the errors at rest and in motion, for use in measurements."""
         return float(np.nanmax([self.rest.rms, self.motion]))
 
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """Precision of one recording: sums for position [m^2] and rotation [rad^2], and what the plot shows.
+    """Precision of one recording: sums for position [m^2] and rotation [rad^2], and data of the plot.
 
-    `position_error`, `rotation_error` (n, 3) hold each pose's error, NaN where none could be had;
-    `neighbourhoods` the poses in the smooth paths of position and rotation.
+    `position_error`, `rotation_error` (n, 3) are each pose's error, NaN if unknown; `neighbourhoods` are the
+    numbers of poses in the smooth paths of position and rotation.
     """
 
     series: PoseSeries
@@ -138,21 +138,19 @@ class Precision:
 def tracker_precision(series: PoseSeries) -> Precision:
     """Return the precision of a recording.
 
-    Raises PerceptionError for a recording that is too short to tell, or in which nothing varies at all.
+    Raises PerceptionError for a recording that is too short, or in which all poses are equal.
     """
     runs = [run for run in _gapless(series.time) if run.stop - run.start >= 4 * NEIGHBOURHOODS[0]]
     if not runs:
-        raise PerceptionError(f"{series.name}: no stretch of poses without a gap that is long enough")
+        raise PerceptionError(f"{series.name}: no sequence of poses without a gap is long enough")
     residuals = {size: _smooth_residuals(series, runs, size) for size in _sizes(runs)}
     noise = _rms(residuals[NEIGHBOURHOODS[0]][0]), _rms(residuals[NEIGHBOURHOODS[0]][1])
     if not noise[0] > 0.0:
-        raise PerceptionError(
-            f"{series.name}: the poses do not vary at all; this is no recording of a tracker"
-        )
+        raise PerceptionError(f"{series.name}: all poses are equal; this is not a recording of a tracker")
     segments = [segment for run in runs for segment in _split(series, run, noise)]
     if not segments:
         raise PerceptionError(
-            f"{series.name}: nothing is at rest or in motion for {SHORTEST:g} s without a gap"
+            f"{series.name}: no segment at rest or in motion for {SHORTEST:g} s without a gap"
         )
     sizes = _best_size(residuals, segments, 0), _best_size(residuals, segments, 1)
     smooth = [residuals[size][quantity] for quantity, size in enumerate(sizes)]
@@ -201,7 +199,7 @@ def _gapless(time: Array) -> list[Segment]:
 
 
 def _sizes(runs: Iterable[Segment]) -> list[int]:
-    """Neighbourhoods that fit into the longest run."""
+    """Lengths of neighbourhoods that fit into the longest run."""
     longest = max(run.stop - run.start for run in runs)
     return [size for size in NEIGHBOURHOODS if size <= longest // 2]
 
@@ -209,7 +207,7 @@ def _sizes(runs: Iterable[Segment]) -> list[int]:
 def _best_size(
     residuals: Mapping[int, tuple[Array, Array]], segments: Sequence[Segment], quantity: int
 ) -> int:
-    """The neighbourhood that predicts left-out poses best, in motion where there is any.
+    """Length of the neighbourhood that predicts left-out poses best, in motion if there is any.
 
     The residual of a left-out pose is its residual over 1 - h. The worst hundredth is left out: a few
     outliers must not choose.
@@ -275,7 +273,7 @@ def _split(series: PoseSeries, run: Segment, noise: tuple[float, float]) -> list
         if moves[first]:
             segments.append(Segment(start, stop, False))
         else:
-            # What creeps from one end to the other moves, if slowly.
+            # A body that creeps from one end to the other is in slow motion.
             steady = _steady(series, start, stop, noise, shortest)
             segments += steady or [Segment(start, stop, False)]
     return segments

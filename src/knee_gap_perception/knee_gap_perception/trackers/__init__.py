@@ -1,1 +1,1 @@
-"""Rigid bodies from OptiTrack in every form a lab has it: topics, NatNet from Motive, exported takes."""
+"""Sources of tracked rigid bodies: topics, NatNet from Motive, and exported takes."""

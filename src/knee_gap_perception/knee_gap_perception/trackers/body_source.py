@@ -1,4 +1,4 @@
-"""What every input of tracked bodies gives: frames of bodies with stamps, and a word on how it fares."""
+"""Interface of a source of tracked bodies: frames of bodies with stamps, and its status."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,9 +16,9 @@ class UnknownBodyError(PerceptionError):
 class BodyFrame:
     """The bodies of one frame of the tracker, Z up, in metres.
 
-    `stamp_ns` is the time of exposure on the clock of ROS, or of arrival where `stamp_is_arrival` says so.
-    `names` are all bodies that the tracker knows, by streaming id where it has ids; those that it does not
-    see may be missing from `bodies`.
+    `stamp_ns` is the time of exposure by the ROS clock, or of arrival if `stamp_is_arrival`. `names` are all
+    bodies of the tracker, by streaming id if it has ids; bodies that are not tracked may be missing from
+    `bodies`.
     """
 
     stamp_ns: int
@@ -29,7 +29,7 @@ class BodyFrame:
 
 @dataclass(frozen=True)
 class SourceStatus:
-    """Whether data come, in plain words and with numbers for diagnostics."""
+    """Status of a source: whether it delivers data, in words and with numbers for diagnostics."""
 
     ok: bool
     words: str
@@ -58,20 +58,20 @@ class BodySource(Protocol):
         """Topics to subscribe to; none if the source receives by itself."""
 
     def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
-        """Return the frames since the last call, in their order; waits up to `timeout` [s] for one."""
+        """Return the frames since the last call, in order; wait up to `timeout` [s] for one."""
 
     def status(self) -> SourceStatus:
-        """Return how the source fares now."""
+        """Return the present status."""
 
     def close(self) -> None:
-        """Let go of what the source holds."""
+        """Release the source's resources."""
 
 
 def choose_body(frame: BodyFrame, wanted: str) -> tuple[BodyPose | None, tuple[BodyPose, ...]]:
-    """Return the wanted body of a frame, None where it is not seen, and the others.
+    """Return the wanted body of a frame, None if it is not tracked, and the others.
 
-    `wanted` is a name or a streaming id; empty, it is the only body there is. Raises UnknownBodyError where
-    the tracker has no such body, or several to choose from.
+    `wanted` is a name or a streaming id; if it is empty, the only body. Raises UnknownBodyError if the
+    tracker has no such body, or if it is empty and there are several bodies.
     """
     name = _name(frame.names, wanted)
     bodies = {body.name: body for body in frame.bodies}

@@ -1,10 +1,10 @@
-"""Takes that Motive exported as CSV, format versions 1.20 to 1.25, to poses in metres with Z up.
+"""Reader of Motive takes exported as CSV, format versions 1.20 to 1.25: poses in metres with Z up.
 
-The first line holds keys and values (units, rotation type, start time); then come rows that say of each
-column its type, its body's name, its id, sometimes its parent, and whether it is rotation, position or error;
-then a row with the axes, which starts with `Frame`; then the frames. An empty cell is a body that was not
-seen: NaN here, never a number. Euler angles are degrees about the body's own axes, one after the other in the
-order of the rotation type (the vendor calls it relative).
+The first line contains keys and values (units, rotation type, start time). The next rows give, for each
+column, its type, its body's name, its id, sometimes its parent, and whether it is rotation, position or
+error. A row with the axes, which starts with `Frame`, is followed by the frames. An empty cell is a body that
+was not tracked; it becomes NaN. Euler angles are in degrees about the body's own axes, one after the other in
+the order of the rotation type (the vendor calls this relative).
 """
 
 import csv
@@ -31,30 +31,30 @@ from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 EULER_ORDERS = tuple("".join(order) for order in permutations("XYZ"))
 BODY_TYPE = "rigid body"
-# What rounding to a millisecond leaves, and the last digit of a rate over a long take [s].
+# Tolerance for times rounded to a millisecond, and for the last digit of a rate over a long take [s].
 ROUNDED_TIME = 0.6e-3
 # An hour of ten bodies at 240 Hz; the rows take some times as much memory.
 MOST_BYTES = 512 << 20
-# Of a frame's number, and its time [s].
+# Largest number of a frame, and largest time [s].
 MOST_FRAME_AND_TIME = 1e9
-# Length of a message: a broken file's cells may be of any length and hold line breaks.
+# Largest length of a message, since a broken file's cells can be of any length and contain line breaks.
 MOST_WORDS = 300
 LABELS = ("type", "name", "id", "parent")
 
-# Before and after noon, as the languages that Motive's machines speak write it.
+# Markers of AM and PM in the languages of Motive's machines.
 MORNING = {"am", "vorm", "上午", "午前", "오전", "πμ", "dop", "de"}
 EVENING = {"pm", "nachm", "下午", "午後", "오후", "μμ", "odp", "du"}
 
 
 class TakeError(PerceptionError):
-    """A file that is no take as Motive exports it, or lacks what is needed; the message says where."""
+    """A file that is not a take exported by Motive, or is incomplete; the message names the place."""
 
 
 @dataclass(frozen=True, eq=False)
 class TakeBody:
-    """One rigid body over a take of n frames, Z up; NaN where it was not seen.
+    """One rigid body over a take of n frames, Z up; NaN if it was not tracked.
 
-    `position` (n, 3) [m], `quaternion_xyzw` (n, 4) of unit length, `mean_error` (n,) [m], NaN where not
+    `position` (n, 3) [m], `quaternion_xyzw` (n, 4) of unit length, `mean_error` (n,) [m], NaN if it was not
     exported.
     """
 
@@ -66,7 +66,7 @@ class TakeBody:
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """Whether the body was seen, (n,)."""
+        """Whether the body was tracked, (n,)."""
         numbers = np.hstack([self.position, self.quaternion_xyzw])
         return np.asarray(np.isfinite(numbers).all(axis=1))
 
@@ -75,9 +75,9 @@ class TakeBody:
 class Take:
     """One exported take: `time` (n,) [s] since its start, `frame` (n,) numbers, and its bodies.
 
-    `start` is the capture's start by the clock of the machine that ran Motive, whose time zone the file does
-    not tell (stated here as UTC); None where it cannot be read. `exported_count` is what the file says it
-    holds.
+    `start` is the capture's start by the clock of Motive's machine. The file does not contain its time zone,
+    so it is marked as UTC here; None if it cannot be read. `exported_count` is the number of frames by the
+    file's header.
     """
 
     version: str
@@ -90,7 +90,7 @@ class Take:
     bodies: tuple[TakeBody, ...]
 
     def body(self, wanted: str) -> TakeBody:
-        """Return a body by name or id. Raises UnknownBodyError, with those that there are."""
+        """Return a body by name or id. Raises UnknownBodyError with the list of bodies."""
         for body in self.bodies:
             if wanted in (body.name, body.id):
                 return body
@@ -98,7 +98,7 @@ class Take:
         raise UnknownBodyError(f"the take has no rigid body '{wanted}'; it has: {known or 'none'}")
 
     def frames(self, start_ns: int) -> Iterator[BodyFrame]:
-        """Yield each frame with stamps that start at `start_ns`; a body that was not seen is marked so."""
+        """Yield each frame with stamps that start at `start_ns`; bodies that were not tracked are marked."""
         names = dict(enumerate((body.name for body in self.bodies), start=1))
         for index, time in enumerate(self.time):
             stamp_ns = start_ns + round(float(time) * 1e9)
@@ -118,7 +118,7 @@ class Take:
 
 @dataclass(frozen=True)
 class _BodyColumns:
-    """Where one body's numbers stand."""
+    """Columns of one body."""
 
     name: str
     id: str
@@ -128,14 +128,14 @@ class _BodyColumns:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """All of them."""
+        """All columns."""
         return (*self.rotation, *self.position, *(() if self.error is None else (self.error,)))
 
 
 def read_take(path: Path, *, up_axis: str = "y", partial: bool = False) -> Take:
     """Read a take. A file that ends in the middle of a line is refused unless `partial` is set.
 
-    Raises TakeError, with the line and the rule, for a file that is no take or not whole.
+    Raises TakeError, with the line and the rule, if the file is not a take or is incomplete.
     """
     rows = _rows(path)
     try:
@@ -174,18 +174,18 @@ def _rows(path: Path) -> list[list[str]]:
         raise TakeError(str(error)) from None
     first_line = re.split("[\r\n]", text, maxsplit=1)[0]
     delimiter = max(",;\t", key=first_line.count)
-    # A row of our own behind the last: where it does not come out, the text ends inside a quoted cell.
+    # A sentinel row at the end: if it is not parsed as a row, the text ends inside a quoted cell.
     end = "" if text.endswith(("\n", "\r")) else "\n"
     try:
         rows = list(csv.reader(io.StringIO(f"{text}{end}{_END}", newline=""), delimiter=delimiter))
     except csv.Error as error:
-        raise TakeError(f"{path.name}: no take of Motive: {error}") from None
+        raise TakeError(f"{path.name}: not a take of Motive: {error}") from None
     is_quote_open = rows[-1] != [_END]
     rows = rows if is_quote_open else rows[:-1]
     if not rows or not rows[0] or rows[0][0].strip() != "Format Version":
-        raise TakeError(f"{path.name}: no take of Motive: its first line must start with 'Format Version'")
+        raise TakeError(f"{path.name}: not a take of Motive: its first line must start with 'Format Version'")
     if is_quote_open or end:
-        # Motive ends every line; half a number at the end would pass for a whole one.
+        # Motive ends every line; without this check, half a number at the end would be read as a whole one.
         rows[-1] = [*rows[-1][:-1], _CUT]
     return [row for row in rows if any(cell.strip() for cell in row)]
 
@@ -217,7 +217,7 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
         row[1].strip().lower(): row for row in above if len(row) > 1 and row[1].strip().lower() in LABELS
     }
     kinds, axes = above[-1], rows[axes_index]
-    # Old versions do not say which row is which.
+    # Old versions do not label the rows.
     types, names, ids = (
         labelled.get(label, [] if labelled else above[index]) for index, label in enumerate(LABELS[:3])
     )
@@ -228,7 +228,7 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
     identity: dict[str, str] = {}
     for index in range(2, len(axes)):
         name = _cell(names, index)
-        # Where no row tells the types: what has a rotation is a body.
+        # Without a row of types, columns with a rotation belong to a body.
         if _cell(types, index).lower() != BODY_TYPE if types else name not in turning:
             continue
         identity.setdefault(name, _cell(ids, index))
@@ -236,7 +236,7 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
         key = "error" if "error" in kind.lower() else f"{kind.lower()} {axis}"
         if key in columns.setdefault(name, {}):
             raise TakeError(
-                f"two columns are called '{kind} {axis}' of '{name}': bodies need names that differ"
+                f"two columns are named '{kind} {axis}' of '{name}': bodies must have different names"
             )
         columns[name][key] = index
     bodies = [_columns_of(name, identity[name], found) for name, found in columns.items()]
@@ -244,7 +244,7 @@ def _header(rows: list[list[str]]) -> tuple[dict[str, str], list[_BodyColumns], 
 
 
 def _cell(row: list[str], index: int) -> str:
-    """Text of a cell on one line, empty where there is none."""
+    """Text of a cell on one line, empty if there is none."""
     return " ".join(row[index].split()) if index < len(row) else ""
 
 
@@ -257,7 +257,7 @@ def _columns_of(name: str, identity: str, found: dict[str, int]) -> _BodyColumns
 
 
 def _rotation_order(header: dict[str, str], bodies: list[_BodyColumns]) -> str | None:
-    """Order of the Euler angles, None for quaternions, which four numbers are whether or not it is said."""
+    """Order of the Euler angles, None for quaternions; four numbers are a quaternion in any case."""
     kind = header.get("Rotation Type", "")
     if not kind and all(len(body.rotation) == 4 for body in bodies):
         return None
@@ -280,7 +280,7 @@ def _metres(header: dict[str, str]) -> float:
 
 
 def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, partial: bool) -> Array:
-    """Numbers of all frames (n, width): NaN where a cell is empty, no number, or not needed."""
+    """Numbers of all frames (n, width): NaN if a cell is empty, not a number, or not needed."""
     cells = np.full((len(rows), width), np.nan)
     for index, row in enumerate(rows):
         line = first + index + 2
@@ -291,26 +291,26 @@ def _cells(rows: list[list[str]], first: int, width: int, needed: list[int], *, 
             if not partial:
                 raise TakeError(
                     f"line {line}: the file ends in the middle of it, after {index} whole frames; export it "
-                    "again, or read what there is with --partial"
+                    "again, or read these frames with --partial"
                 )
             return cells[:index]
         if is_cut:
-            raise TakeError(f"line {line}: {len(row)} cells, where {width} belong")
+            raise TakeError(f"line {line}: {len(row)} cells instead of {width}")
         if len(row) > width:
             raise TakeError(
-                f"line {line}: {len(row)} cells, where {width} belong: numbers with a decimal comma in a "
+                f"line {line}: {len(row)} cells instead of {width}: numbers with a decimal comma in a "
                 "file that is separated by commas; export it with a decimal point"
             )
         for column in needed:
             if row[column]:
                 cells[index, column] = _number(row[column])
         if not (np.abs(cells[index, :2]) <= MOST_FRAME_AND_TIME).all():
-            raise TakeError(f"line {line}: no frame number and time, but '{row[0]}', '{row[1]}'")
+            raise TakeError(f"line {line}: '{row[0]}', '{row[1]}' are not a frame number and a time")
     return cells
 
 
 def _exact_times(time: Array, frame: Array, rate: float) -> Array:
-    """Times [s] by the frames' numbers where those agree: some exports round times to milliseconds."""
+    """Times [s] from the frame numbers if they agree, since some exports round times to milliseconds."""
     if not rate > 0.0:
         return time
     exact = frame / rate
@@ -318,7 +318,7 @@ def _exact_times(time: Array, frame: Array, rate: float) -> Array:
 
 
 def _without_empty_end(row: list[str]) -> list[str]:
-    """The cells up to the last that holds anything."""
+    """The cells up to the last one that is not empty."""
     last = max((index for index, cell in enumerate(row) if cell.strip()), default=-1)
     return row[: last + 1]
 
@@ -353,16 +353,16 @@ def _body(cells: Array, columns: _BodyColumns, order: str | None, scale: float, 
 
 
 def _quaternions(angles: Array, order: str | None) -> Array:
-    """Unit quaternions (n, 4); NaN where any number is missing or they are no rotation."""
+    """Unit quaternions (n, 4); NaN if a number is missing or it is not a rotation."""
     result = np.full((len(angles), 4), np.nan)
     whole = np.isfinite(angles).all(axis=1)
     if order is None:
         norms = np.linalg.norm(angles, axis=1)
-        # Six decimals are written; what is further from 1 than rounding was no rotation.
+        # Six decimals are written; a norm that differs from 1 by more than rounding is not a rotation.
         whole &= np.abs(norms - 1.0) < 1e-3
         result[whole] = angles[whole] / norms[whole, None]
     elif whole.any():
-        # The columns are X, Y, Z whatever the order in which they turn.
+        # The columns are X, Y, Z, whatever the order of the rotations.
         turned = angles[whole][:, ["XYZ".index(axis) for axis in order]]
         result[whole] = Rotation.from_euler(order, turned, degrees=True).as_quat()
     return result

@@ -1,7 +1,7 @@
-"""Bodies from geometry_msgs/PoseStamped topics, one a body.
+"""Source of bodies from geometry_msgs/PoseStamped topics, one per body.
 
-So natnet_ros2, vrpn_mocap and mocap_optitrack publish them. Such drivers tell neither validity nor the time
-of exposure: the stamp is what they put there, mostly the time of arrival.
+natnet_ros2, vrpn_mocap and mocap_optitrack publish them. These drivers report neither validity nor the time
+of exposure: the stamp is whatever they set, mostly the time of arrival.
 """
 
 from collections import deque
@@ -56,7 +56,7 @@ class PoseTopics:
         )
 
     def put(self, name: str, message: Any) -> None:
-        """Take a message of the topic of a body."""
+        """Add a message of a body's topic."""
         raw = body_pose_from_message(message, name)
         body = BodyPose(
             stamp_ns=raw.stamp_ns,
@@ -67,7 +67,7 @@ class PoseTopics:
         self._counts[name] += 1
         queue = self._waiting if name == self._scope else self._recent[name]
         if queue and body.stamp_ns < queue[-1].stamp_ns:
-            # A bag that starts again: nothing of its end may be paired with its beginning.
+            # A bag that starts again: its end must not be paired with its beginning.
             queue.clear()
         queue.append(body)
 
@@ -86,14 +86,14 @@ class PoseTopics:
         return frames
 
     def status(self) -> SourceStatus:
-        """Return which topics were silent since the last call."""
+        """Return the status, with the topics without messages since the last call."""
         silent = [name for name, count in self._counts.items() if count == self._last_counts[name]]
         self._last_counts = dict(self._counts)
         words = f"no poses of {', '.join(silent)}: is the driver running, and its topic the right one?"
         return SourceStatus(not silent, words if silent else "poses come", dict(self._counts))
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing; there are no resources."""
 
     def _at(self, name: str, stamp_ns: int) -> BodyPose | None:
         poses = self._recent[name]

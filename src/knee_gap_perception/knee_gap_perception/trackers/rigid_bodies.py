@@ -1,7 +1,6 @@
-"""Bodies from mocap4r2_msgs/RigidBodies, by the message's fields, wherever its class comes from.
+"""Source of bodies from mocap4r2_msgs/RigidBodies, by field name, for any message class.
 
-A body that the tracker does not see is missing from the message or repeats its last pose; there is no valid
-bit.
+A body that is not tracked is missing from the message or repeats its last pose; there is no valid bit.
 """
 
 from collections import deque
@@ -35,7 +34,7 @@ class RigidBodiesTopic:
         return (Subscription("rigid_bodies", "mocap4r2_msgs/msg/RigidBodies", self.put),)
 
     def put(self, message: Any) -> None:
-        """Take a message."""
+        """Add a message."""
         self._count += 1
         stamp = stamp_ns(message.header)
         bodies = tuple(self._body(item, stamp) for item in message.rigidbodies)
@@ -52,18 +51,18 @@ class RigidBodiesTopic:
         return frames
 
     def status(self) -> SourceStatus:
-        """Return whether messages came since the last call."""
+        """Return the status: whether messages arrived since the last call."""
         came = self._count - self._last_count
         self._last_count = self._count
         words = (
-            "rigid bodies come"
+            "rigid bodies received"
             if came
             else "no rigid bodies: is the driver running and the topic the right one?"
         )
         return SourceStatus(came > 0, words, {"messages": self._count})
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing; there are no resources."""
 
     def _body(self, item: Any, stamp_ns: int) -> BodyPose:
         place, turn = item.pose.position, item.pose.orientation
@@ -77,7 +76,7 @@ class RigidBodiesTopic:
         )
 
     def _number(self, name: str) -> int:
-        """The streaming id, which drivers give as the name; else a number that is free."""
+        """The streaming id, which drivers give as the name; else a free number."""
         if name.isdecimal() and int(name) not in self._names:
             return int(name)
         return max(self._names, default=0) + 1

@@ -1,4 +1,4 @@
-"""The tracked scope from whichever source a lab has, and what is wrong when it does not come."""
+"""Feed of the tracked scope from the configured source, with a diagnosis if there are no data."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -50,7 +50,7 @@ SOURCES = {
 
 @dataclass(frozen=True)
 class SourceParameters:
-    """Where tracked bodies come from. Raises PerceptionError for values outside their choices."""
+    """Source of tracked bodies. Raises PerceptionError for values outside their choices."""
 
     source: str = field(
         default="pose",
@@ -64,14 +64,14 @@ class SourceParameters:
         default="",
         metadata={
             "description": "Rigid body of the scope, by name or streaming id, for rigid_bodies and natnet; "
-            "empty is the only one there is"
+            "empty: the only body"
         },
     )
     up_axis: str = field(
         default="auto",
         metadata={
-            "description": "Axis that points up in what comes; auto is y for natnet, as Motive is set first, "
-            "and z for topics, as REP-103 wants it",
+            "description": "Axis that points up in the source's data; auto: y for natnet, Motive's default, "
+            "and z for topics, as in REP-103",
             "choices": ("auto", *UP_AXES),
         },
     )
@@ -108,7 +108,7 @@ class ScopeFeed:
         self._fault = ""
 
     def poll(self, timeout: float = 0.0) -> list[tuple[BodyPose, tuple[BodyPose, ...]]]:
-        """Return the scope's body and the others of each new frame in which the scope is told of.
+        """Return the scope's body and the others of each new frame that contains the scope.
 
         Only a source that `waits` does, for at most `timeout` [s].
         """
@@ -125,12 +125,12 @@ class ScopeFeed:
         return chosen
 
     def status(self) -> SourceStatus:
-        """Return how the source fares, and whether it has the body that is wanted."""
+        """Return the status of the source, and whether it has the wanted body."""
         status = self.source.status()
         if status.ok and self._fault:
             return SourceStatus(False, self._fault, status.values)
         return status
 
     def close(self) -> None:
-        """Let go of what the source holds."""
+        """Release the source's resources."""
         self.source.close()

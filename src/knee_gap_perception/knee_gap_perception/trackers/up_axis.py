@@ -1,9 +1,8 @@
-"""Motive's axes to those of ROS, once, where bodies come in.
+"""Conversion of Motive's axes to those of ROS, applied once at the input.
 
-Motive's ground is X-Z with Y up unless it is set otherwise; REP-103 wants Z up. A body of a Y-up stream is
-given here exactly as Motive would give it with its up axis set to Z: the ground turned about X (x, y, z -> x,
--z, y), and the axes of the body with it, so that a calibration of the body stays right whichever way Motive
-is set.
+Motive's ground is X-Z with Y up unless it is set otherwise; REP-103 has Z up. A body of a Y-up stream is
+converted to what Motive would send with its up axis set to Z: the ground rotated about X (x, y, z -> x, -z,
+y), and the axes of the body with it. So a calibration of the body is valid for both settings of Motive.
 """
 
 import numpy as np
@@ -21,7 +20,7 @@ def position_z_up(position: npt.ArrayLike, up_axis: str) -> Array:
 
 
 def quaternion_z_up(quaternion_xyzw: npt.ArrayLike, up_axis: str) -> Array:
-    """Quaternions (..., 4) with Z up: C R C^T for the turn C of the axes turns the axis of R."""
+    """Quaternions (..., 4) with Z up: C R C^T, for the rotation C of the axes, rotates the axis of R."""
     quaternion = np.asarray(quaternion_xyzw, dtype=np.float64)
     return np.concatenate([_z_up(quaternion[..., :3], up_axis), quaternion[..., 3:]], axis=-1)
 

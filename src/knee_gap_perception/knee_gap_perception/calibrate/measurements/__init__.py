@@ -1,1 +1,1 @@
-"""Measurements taken from a recording: boards, image motion, poses."""
+"""Measurements from a recording: boards, image motion, poses."""

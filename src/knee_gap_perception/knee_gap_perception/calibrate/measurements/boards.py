@@ -1,4 +1,4 @@
-"""Calibration boards and finding them in an image: ChArUco, asymmetric and symmetric dot grids.
+"""Calibration boards and their detection in an image: ChArUco, asymmetric and symmetric dot grids.
 
 Board frame: the board is the plane z = 0, x along its columns, y along its rows [m].
 """
@@ -16,24 +16,24 @@ from knee_gap_perception.errors import PerceptionError
 
 _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
 DARK, UNEVEN = 0.6, 0.12  # of the paper around a dot: the dot's brightness, and the paper's unevenness
-MIN_POINTS = 8  # a view with fewer points says too little about its own pose
+MIN_POINTS = 8  # fewer points do not determine the pose of a view well
 BOARD_SYNTAX = (
     "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM[:DICTIONARY], dots:COLUMNSxROWS:PITCH_MM (asymmetric, pitch "
     "between rows of one column, as OpenCV counts it) or symmetric_dots:COLUMNSxROWS:PITCH_MM"
 )
 
 
-# What found points have in common over many views, at the border of the picture [px]: no residual shows it,
-# as camera and poses take it up. Corners are refined between edges that perspective leaves straight; the
-# middle of a dot's picture is not the picture of its middle. By these sizes the errors of simulated
-# calibrations are covered: see `bench_calibration`.
+# Bias of detected points that is common to many views, at the border of the image [px]. No residual shows it,
+# since camera and poses absorb it. Corners are refined between edges that stay straight under perspective;
+# the centre of a dot's image is not the image of its centre. These sizes cover the errors of simulated
+# calibrations: see `bench_calibration`.
 CORNER_BIAS_PX, DOT_BIAS_PX = 0.02, 0.11
 
 
 class BoardView(NamedTuple):
     """A board in one image: point ids (n,), points (n, 3) [m] in the board's frame, pixels (n, 2).
 
-    `bias_px` is the size of the error that the points of many views have in common.
+    `bias_px` is the size of the error that is common to the points of many views.
     """
 
     stamp_ns: int
@@ -44,14 +44,14 @@ class BoardView(NamedTuple):
 
 
 class Board(Protocol):
-    """What the calibration asks of a board."""
+    """Interface of a calibration board."""
 
     @property
     def has_orientation(self) -> bool:
-        """Whether the board looks different when it is turned by half a turn."""
+        """Whether the board looks different if it is rotated by half a turn."""
 
     def find(self, image: npt.NDArray[np.uint8], stamp_ns: int) -> BoardView | None:
-        """The board in a grey or colour image; None where it is not found."""
+        """The board in a grey or colour image; None if it is not found."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +77,16 @@ class CharucoBoard:
 
     @property
     def has_orientation(self) -> bool:
-        """Markers tell every corner apart."""
+        """True, since the markers identify every corner."""
         return True
 
     def opencv(self) -> Any:
-        """The board as OpenCV's object, which draws and finds it."""
+        """OpenCV's object of the board, which draws and detects it."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
 
     def find(self, image: npt.NDArray[np.uint8], stamp_ns: int = 0) -> BoardView | None:
-        """Corners of the squares that lie between found markers, to a fraction of a pixel."""
+        """Corners of the squares between detected markers, to a fraction of a pixel."""
         grey = _grey(image)
         board = self.opencv()
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
@@ -116,7 +116,7 @@ class DotGrid:
 
     @property
     def has_orientation(self) -> bool:
-        """A symmetric grid looks the same when it is turned by half a turn."""
+        """False for a symmetric grid, which looks the same if it is rotated by half a turn."""
         return self.asymmetric
 
     @property
@@ -128,7 +128,7 @@ class DotGrid:
         return np.asarray(flat * self.pitch, dtype=np.float64)
 
     def find(self, image: npt.NDArray[np.uint8], stamp_ns: int = 0) -> BoardView | None:
-        """The dots, where every one of them is in the image."""
+        """The dots, if all of them are in the image."""
         layout = cv2.CALIB_CB_ASYMMETRIC_GRID if self.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
         grey = _grey(image)
         detector = cv2.SimpleBlobDetector.create(_blobs(grey.size))
@@ -137,7 +137,7 @@ class DotGrid:
         )
         dots = _printed(grey, detector.detect(grey)) if not found else ()
         if len(dots) >= self.columns * self.rows:
-            # Without a detector OpenCV takes the dots themselves, which its stub does not know.
+            # Without a detector, OpenCV takes the dots themselves; its type stub does not declare that.
             found, centres = cv2.findCirclesGrid(  # type: ignore[call-overload]
                 dots, (self.columns, self.rows), layout | cv2.CALIB_CB_CLUSTERING, None, _FINDER
             )
@@ -148,9 +148,9 @@ class DotGrid:
 
 
 def board_from_text(text: str) -> Board:
-    """The board that a text such as `charuco:12x9:3.0:2.2` names.
+    """The board described by a text such as `charuco:12x9:3.0:2.2`.
 
-    Raises PerceptionError for a text that is not one, saying what is.
+    Raises PerceptionError with the syntax for any other text.
     """
     kind, *fields = text.split(":")
     try:
@@ -163,7 +163,7 @@ def board_from_text(text: str) -> Board:
     except (IndexError, ValueError) as error:
         if isinstance(error, PerceptionError):
             raise
-    raise PerceptionError(f"a board is {BOARD_SYNTAX}; '{text}' is not")
+    raise PerceptionError(f"'{text}' is not a board; a board is {BOARD_SYNTAX}")
 
 
 def _grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -173,8 +173,8 @@ def _grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def _refined(grey: npt.NDArray[np.uint8], corners: Any, points: Array, clear: float) -> Array:
-    """Corners refined in a window that keeps `clear` [m] of the corner, where the nearest marker begins."""
-    # The distance to the nearest neighbour, in pixels and in metres, is the scale of the picture there.
+    """Corners refined in a window that ends `clear` [m] from the corner, where the nearest marker begins."""
+    # The distance to the nearest neighbour, in pixels and in metres, gives the scale of the image there.
     apart_px = np.linalg.norm(corners[:, None] - corners[None], axis=2)
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(apart_px, np.inf)
@@ -195,9 +195,9 @@ _FINDER = cv2.CirclesGridFinderParameters()
 
 
 def _printed(grey: npt.NDArray[np.uint8], blobs: Sequence[cv2.KeyPoint]) -> npt.NDArray[np.float32]:
-    """Centres (n, 1, 2) of the blobs that are ink on paper: far darker than an even ring around them.
+    """Centres (n, 1, 2) of the blobs that are ink on paper: much darker than an even ring around them.
 
-    What lies around the board may show more blobs than the board does.
+    The surroundings of the board may show more blobs than the board.
     """
     ring = np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=-1)
     kept = []

@@ -1,4 +1,4 @@
-"""How the picture moves from one image to the next: shift, zoom, turn and shear, no board needed."""
+"""Motion between consecutive images: shift, zoom, rotation and shear, without a board."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -14,8 +14,8 @@ WORKING_ROWS = 360
 MAX_FEATURES = 300
 MIN_FEATURES = 25
 WINDOW_PX = (15, 15)
-MAX_INTERVAL = 0.2  # [s] between two images that are still compared
-EDGE_MARGIN = 0.06  # of the field's radius: its border stands still whatever moves
+MAX_INTERVAL = 0.2  # [s] largest interval between two images that are compared
+EDGE_MARGIN = 0.06  # of the field's radius: its border does not move with the scene
 
 
 class ImageMotion(NamedTuple):
@@ -78,7 +78,7 @@ def _affine_flow(
 def _followed(
     before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], points: Any
 ) -> tuple[Any, npt.NDArray[np.bool_]]:
-    """Where points (n, 1, 2) of one image are in another, and which were found (n,)."""
+    """Positions of points (n, 1, 2) of one image in another, and which were found (n,)."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, np.empty(0), winSize=WINDOW_PX, maxLevel=3
     )
@@ -86,7 +86,7 @@ def _followed(
 
 
 def _robust_affine(position: Array, shift: Array) -> Array | None:
-    """Affine fit (6,) by reweighted least squares (Cauchy): glare and debris move otherwise."""
+    """Affine fit (6,) by reweighted least squares (Cauchy), since glare and debris move differently."""
     design = np.column_stack([np.ones(len(position)), position])
     weight, solution = np.ones(len(position)), np.zeros((3, 2))
     for _ in range(8):

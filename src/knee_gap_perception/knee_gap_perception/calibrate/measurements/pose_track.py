@@ -1,4 +1,4 @@
-"""Tracked poses over time as one smooth curve: for calibration, which has the recording as a whole."""
+"""Tracked poses as one smooth curve over time, for the calibration, which has the whole recording."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ from knee_gap_perception.errors import PerceptionError
 
 MIN_SAMPLES = 20
 CUTOFF_HZ = 20.0  # a hand's tremor ends at 12 Hz; beyond is the tracker's noise
-MAX_GAP_PERIODS = 3.0  # between samples, beyond which nothing is said of the time between
+MAX_GAP_PERIODS = 3.0  # largest gap between samples that is interpolated
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,11 @@ class PoseTrack:
         stamps, poses = stamps[good], poses[good]
         if len(stamps) < MIN_SAMPLES:
             raise PerceptionError(
-                f"{len(stamps)} tracked poses of the body were read; at least {MIN_SAMPLES} are needed: is "
-                "the pose topic "
-                "right, and did the tracker see the body?"
+                f"{len(stamps)} tracked poses of the body were read; at least {MIN_SAMPLES} are needed: "
+                "is the pose topic right, and did the tracker see the body?"
             )
         quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        # Of the two quaternions of each rotation, the one that continues the curve.
+        # Of the two quaternions of each rotation, use the one that continues the curve.
         flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
         quaternion[1:] *= np.cumprod(np.where(flips == 0, 1, flips))[:, None]
         time = (stamps - stamps[0]) * 1e-9
@@ -62,7 +61,7 @@ class PoseTrack:
         return float(np.median(np.diff(self.stamps_ns))) * 1e-9
 
     def covers(self, stamps_ns: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether samples close enough to each other enclose each stamp (...,) [ns]."""
+        """Whether each stamp (...,) [ns] lies between samples that are close enough to each other."""
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         after = np.searchsorted(self.stamps_ns, stamps)
         inside = (after > 0) & (after < len(self.stamps_ns))
@@ -72,7 +71,7 @@ class PoseTrack:
 
     def at(self, stamps_ns: npt.ArrayLike) -> Array:
         """Poses (..., 4, 4) at stamps (...,) [ns]."""
-        # Stamps are too large for a double's nanosecond; their distance to the first is not.
+        # A double does not resolve a nanosecond of a stamp, but it does for the difference to the first.
         time = np.asarray(np.asarray(stamps_ns) - self.stamps_ns[0], dtype=np.float64) * 1e-9
         quaternion = self._quaternion(time)
         R = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix().reshape(*time.shape, 3, 3)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for many views that share some unknowns and have some of their own.
+"""Bundle adjustment by Levenberg-Marquardt: views with shared unknowns and unknowns of their own.
 
 The unknowns of each view are eliminated by a Schur complement, so the cost grows with the number of views,
 not with its cube (Triggs et al. 1999). Used for the lens with a board pose per view, and for the hand-eye
@@ -46,20 +46,20 @@ def block(residual: Array, by_shared: Array, by_own: Array) -> Block:
 
 
 class Problem(Protocol[State]):
-    """What is minimised: a sum of squares over views."""
+    """Interface of a minimisation problem: a sum of squares over views."""
 
     def blocks(self, state: State) -> Sequence[Block]:
-        """Normal equations of every view about a state."""
+        """Normal equations of every view at a state."""
 
     def cost(self, state: State) -> float:
-        """Sum of squares; infinite where the state is impossible."""
+        """Sum of squares; infinite if the state is impossible."""
 
     def moved(self, state: State, shared_step: Array, own_steps: Sequence[Array]) -> State:
         """The state after a step of the shared unknowns (m,) and of each view's own (l,)."""
 
 
 def minimise(problem: Problem[State], state: State, iterations: int = 60) -> State:
-    """The state of least squares that Levenberg-Marquardt reaches from a given one."""
+    """State of least squares that Levenberg-Marquardt reaches from an initial state."""
     cost, damping = problem.cost(state), 1e-3
     for _ in range(iterations):
         blocks = problem.blocks(state)
@@ -80,7 +80,7 @@ def minimise(problem: Problem[State], state: State, iterations: int = 60) -> Sta
 
 
 def _step(blocks: Sequence[Block], damping: float) -> tuple[Array, list[Array]]:
-    """Steps under Marquardt's damping of the diagonals."""
+    """Steps with Marquardt's damping of the diagonals."""
     damped = [
         b._replace(
             shared=b.shared + damping * np.diag(np.diag(b.shared)),

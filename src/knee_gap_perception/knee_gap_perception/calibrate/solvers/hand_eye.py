@@ -1,14 +1,14 @@
-"""Where the lens sits on the tracked body (hand-eye calibration), with a covariance that means what it says.
+"""Hand-eye calibration: the pose of the lens on the tracked body, with its covariance.
 
-OpenCV's closed-form solvers start it: the five of `calibrateHandEye` and the two of
+The initial state comes from OpenCV's closed-form solvers: the five of `calibrateHandEye` and the two of
 `calibrateRobotWorldHandEye`. The best of them is refined by least squares on the reprojected board points of
 all views,
 
     pixel = project(T_lens_body exp(-e) T_body_world T_world_board point),
 
-with a pose error e of the tracker in each view, weighted by its variance. That variance is estimated along
-with the rest by restricted maximum likelihood, so that the covariance of the result rests on what the data
-show, not on a brochure.
+with a pose error e of the tracker in each view, weighted by its variance. That variance is estimated jointly
+by restricted maximum likelihood, so that the covariance of the result is based on the data, not on the
+tracker's data sheet.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,25 +39,25 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis, roll
 
 MIN_VIEWS = 4
-MIN_TURN = np.radians(5.0)  # RMS rotation that the views need about a second axis
-MIN_SCOPE_ROTATION = np.radians(20.0)  # spread of scope turns from which the shaft's axis can be told
+MIN_TURN = np.radians(5.0)  # least RMS rotation of the views about a second axis
+MIN_SCOPE_ROTATION = np.radians(20.0)  # least range of scope rotations to estimate the shaft's axis
 
-# Table 3 of the paper, set 1: the ratio of these two shapes the tracker's error, its size is estimated.
+# Table 3 of the paper, set 1: the ratio of the tracker's two errors; their size is estimated.
 TRANSLATION_ERROR = 0.0367e-3
 ROTATION_ERROR = np.radians(0.004)
 START_SCALE = 5.0
-OUTLYING_TIMES, OUTLYING_PX = 6.0, 2.0  # a view is left out beyond both, in medians and in pixels
+OUTLYING_TIMES, OUTLYING_PX = 6.0, 2.0  # a view above both is left out: multiples of the median, and pixels
 OUTLYING_VIEWS = 12
-# What a bias of the points that is alike in all views does to the lens, in shares of the angle under which
-# the bias is seen at the border of the picture (x, y, z): turns, and shifts by angle x distance. Most of all
-# it looks like another distance.
+# Effect on the lens of a bias of the points that is common to all views, as fractions of the angle of the
+# bias at the border of the image (x, y, z): rotations, and shifts by angle x distance. The largest effect is
+# on the distance.
 BIAS_TURNS, BIAS_SHIFTS = (0.5, 0.5, 0.25), (0.5, 0.5, 2.0)
-# What smoothing takes from a hand's tremor, as an error of the clock [s], and what the bias adds [s/px].
+# Errors of the clock: by the smoothing of a hand's tremor [s], and by the bias of the points [s/px].
 ERROR_OF_SMOOTHING, TIME_BY_BIAS = 3e-5, 4e-4
 
 
 class SolverResult(NamedTuple):
-    """What one closed-form solver says, and the RMS reprojection it leaves [px]."""
+    """Result of one closed-form solver, and its RMS reprojection error [px]."""
 
     name: str
     T_body_lens: Array
@@ -66,7 +66,7 @@ class SolverResult(NamedTuple):
 
 @dataclass(frozen=True)
 class HandEyeSettings:
-    """What is estimated beside the two poses, and the tracker's presumed error (RMS lengths [m], [rad])."""
+    """Options: what is estimated besides the two poses, and the tracker's prior error (RMS [m], [rad])."""
 
     free_intrinsics: bool = True
     free_time_offset: bool = True
@@ -77,12 +77,12 @@ class HandEyeSettings:
 
 @dataclass(frozen=True)
 class HandEye:
-    """The lens on its body.
+    """The pose of the lens on its body.
 
-    `covariance` (6, 6) is of the twist (rotation, translation) of T_body_lens in the lens frame: the error
-    that all views have in common. `time_offset` is what is to be added to an image's stamp, beyond what was
-    added already, to read the tracker's clock. `rotation_error` [rad] and `translation_error` [m] are the
-    tracker's errors of the body that the views show (RMS lengths).
+    `covariance` (6, 6) is that of the twist (rotation, translation) of T_body_lens in the lens frame: the
+    error common to all views. `time_offset` [s] is to be added to an image's stamp, in addition to the offset
+    already applied, to get the tracker's time. `rotation_error` [rad] and `translation_error` [m] are the
+    tracker's errors of the body estimated from the views (RMS lengths).
     """
 
     T_body_lens: Array
@@ -102,7 +102,7 @@ class HandEye:
 
     @property
     def outlying(self) -> npt.NDArray[np.bool_]:
-        """Views (n,) that the others do not explain; never among few, and never more than a fifth of them."""
+        """Mask (n,) of views that do not fit the others: none among few, and at most a fifth of them."""
         rms = self.left_out_rms_px
         worst = rms > max(OUTLYING_TIMES * float(np.median(rms)), OUTLYING_PX)
         enough = len(rms) >= OUTLYING_VIEWS and worst.mean() <= 0.2
@@ -116,9 +116,9 @@ def calibrate_hand_eye(
     settings: HandEyeSettings | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> HandEye:
-    """Calibrate the lens on its body from views of one board that stands still in the world.
+    """Calibrate the lens on its body from views of one stationary board.
 
-    Raises PerceptionError, saying what to record instead, for too few views and too little rotation.
+    Raises PerceptionError with advice on the recording for too few views and too little rotation.
     """
     chosen = settings or HandEyeSettings()
     _check(views)
@@ -141,17 +141,16 @@ def calibrate_hand_eye(
 def closed_form(
     views: Sequence[TrackedView], intrinsics: Intrinsics, model: LensModel
 ) -> tuple[SolverResult, ...]:
-    """What each of OpenCV's solvers makes of the views at the most frequent turn of the scope.
+    """Results of OpenCV's solvers for the views at the most frequent rotation of the scope.
 
-    Raises PerceptionError where none of them gives a finite answer.
+    Raises PerceptionError if none of them is finite.
     """
     alike, turn = _most_frequent(np.array([view.scope_rotation for view in views]))
     chosen = [views[i] for i in np.flatnonzero(alike)]
     if len(chosen) < MIN_VIEWS:
         raise PerceptionError(
-            f"{len(chosen)} views share one turn of the scope; at least {MIN_VIEWS} are needed: keep the "
-            "light post "
-            "still for a while as well"
+            f"{len(chosen)} views share one rotation of the scope; at least {MIN_VIEWS} are needed: also "
+            "keep the light post still for some time"
         )
     _check(chosen)
     body = np.array([view.T_world_body for view in chosen])
@@ -167,11 +166,11 @@ def closed_form(
             for T, view in zip(lens_board, chosen, strict=True)
         ]
         rms = float(np.sqrt(2 * np.mean(np.concatenate(errors) ** 2)))
-        # Without an axis yet, the reference is the group's own turn: roll back to turn 0 happens in the fit.
+        # There is no axis yet, so the reference is the group's own rotation; the fit converts to rotation 0.
         results.append(SolverResult(name, T_body_lens @ roll(turn), rms))
     results = [result for result in results if np.isfinite(result.rms_px)]
     if not results:
-        raise PerceptionError("no hand-eye solver gives a finite answer: turn the scope about several axes")
+        raise PerceptionError("no hand-eye solver gives a finite result: rotate the scope about several axes")
     return tuple(results)
 
 
@@ -204,25 +203,22 @@ def _joined(R: Any, t: Any) -> Array:
 def _check(views: Sequence[TrackedView]) -> None:
     if len(views) < MIN_VIEWS:
         raise PerceptionError(
-            f"the body was tracked and the board seen in {len(views)} views; at least {MIN_VIEWS} are "
-            "needed, "
-            "20 are good"
+            f"the body was tracked and the board found in {len(views)} views; at least {MIN_VIEWS} are "
+            "needed, 20 are good"
         )
     rotations = Rotation.from_matrix(np.array([view.T_world_body[:3, :3] for view in views]))
     vectors = (rotations.mean().inv() * rotations).as_rotvec()
     turn = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(views))
     if turn[1] < MIN_TURN:
         raise PerceptionError(
-            f"the scope turns by {np.degrees(turn[0]):.1f} deg (RMS) about one axis and "
-            f"{np.degrees(turn[1]):.1f} deg "
-            f"about a second; at least {np.degrees(MIN_TURN):.0f} deg about both are needed: tilt it to "
-            "the sides, up "
-            "and down, and turn it about its shaft"
+            f"the scope rotates by {np.degrees(turn[0]):.1f} deg (RMS) about one axis and "
+            f"{np.degrees(turn[1]):.1f} deg about a second; at least {np.degrees(MIN_TURN):.0f} deg about "
+            "both are needed: tilt it to the sides, up and down, and rotate it about its shaft"
         )
 
 
 def _first_state(bundle: HandEyeBundle, lens: Array, T_body_lens: Array) -> HandEyeState:
-    """The closed-form answer for the most frequent turn, and the axis that takes the lens to the others."""
+    """Initial state: the closed-form pose at the most frequent rotation, and the axis from the others."""
     boards = np.array([board_pose(view.board, lens, bundle.model) for view in bundle.views])
     bodies = np.array([view.T_world_body for view in bundle.views])
     turns = np.array([view.scope_rotation for view in bundle.views])
@@ -232,9 +228,9 @@ def _first_state(bundle: HandEyeBundle, lens: Array, T_body_lens: Array) -> Hand
     if bundle.has_axis:
         if np.ptp(turns) < MIN_SCOPE_ROTATION:
             raise PerceptionError(
-                f"the scope turns by {np.degrees(np.ptp(turns)):.1f} deg in its camera head; the shaft's "
-                "axis needs at "
-                f"least {np.degrees(MIN_SCOPE_ROTATION):.0f} deg: turn the light post further, or not at all"
+                f"the scope rotates by {np.degrees(np.ptp(turns)):.1f} deg in its camera head; the shaft's "
+                f"axis needs at least {np.degrees(MIN_SCOPE_ROTATION):.0f} deg: turn the light post further, "
+                "or not at all"
             )
         lenses = inverse(bodies) @ T_world_board @ inverse(boards)
         axis = _first_axis(lenses, T_body_lens @ roll(-reference), turns - reference)
@@ -243,14 +239,14 @@ def _first_state(bundle: HandEyeBundle, lens: Array, T_body_lens: Array) -> Hand
 
 
 def _most_frequent(turns: Array) -> tuple[npt.NDArray[np.bool_], float]:
-    """Which views share the turn that most have, and that turn [rad]."""
+    """Mask of the views at the most frequent rotation, and that rotation [rad]."""
     alike = np.abs(turns[:, None] - turns[None]) < SAME_TURN
     chosen = alike[alike.sum(axis=1).argmax()]
     return chosen, float(np.median(turns[chosen]))
 
 
 def _first_axis(lenses: Array, lens_at_reference: Array, turns: Array) -> ShaftAxis:
-    """Axis of the rotations S = T_body_lens(turn) Rz(turn) T_body_lens(0)^-1, weighted by their turn."""
+    """Axis of the rotations S = T_body_lens(turn) Rz(turn) T_body_lens(0)^-1, weighted by their angles."""
     unrolled = np.array([T @ roll(turn) for T, turn in zip(lenses, turns, strict=True)])
     moved = unrolled @ inverse(lens_at_reference)
     direction = turns @ Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()
@@ -265,7 +261,7 @@ def _first_axis(lenses: Array, lens_at_reference: Array, turns: Array) -> ShaftA
 
 
 def _refine(bundle: HandEyeBundle, state: HandEyeState) -> tuple[HandEyeBundle, HandEyeState]:
-    """Minimise and re-estimate the tracker's error in turn, until it settles; starts from a generous one."""
+    """Minimise and re-estimate the tracker's error alternately until it converges, from a large one."""
     presumed = bundle.pose_sigma
     bundle = replace(bundle, pose_sigma=START_SCALE * presumed)
     for _ in range(8):
@@ -313,7 +309,7 @@ def _result(
 
 
 def _systematic(bundle: HandEyeBundle, state: HandEyeState) -> Array:
-    """Covariance (6, 6) of what no residual shows: a bias of the found points that is alike in all views."""
+    """Covariance (6, 6) by a bias of the detected points common to all views, which no residual shows."""
     poses = [board_pose(view.board, state.lens, bundle.model) for view in bundle.views]
     distance = float(np.median([np.linalg.norm(T_lens_board[:3, 3]) for T_lens_board in poses]))
     angle = bias_of([view.board for view in bundle.views]) / float(state.lens[0])
@@ -321,7 +317,7 @@ def _systematic(bundle: HandEyeBundle, state: HandEyeState) -> Array:
 
 
 def _time_sigma(bundle: HandEyeBundle, fitted: float) -> float:
-    """Standard error of the clock [s] from that of the fit and what no residual shows; NaN if not fitted."""
+    """Standard error of the clock [s], by the fit and the bias of the points; NaN if not fitted."""
     if not bundle.timed:
         return np.nan
     by_bias = TIME_BY_BIAS * bias_of([view.board for view in bundle.views])
@@ -329,7 +325,7 @@ def _time_sigma(bundle: HandEyeBundle, fitted: float) -> float:
 
 
 def _axis_sigma(sigma: Array, floor: Array) -> tuple[float, float]:
-    """Standard deviations of the axis: tilt [rad] and shift [m], the larger of two each, with the floor's."""
+    """Standard deviations of the axis: tilt [rad] and shift [m], each the larger of two, with the floor."""
     tilt, shift = float(sigma[-4:-2].max()), float(sigma[-2:].max())
     return float(np.hypot(tilt, np.sqrt(floor[0, 0]))), float(np.hypot(shift, np.sqrt(floor[3, 3])))
 
@@ -341,7 +337,7 @@ def _considered(
     information: Array,
     lens: Array,
 ) -> Array:
-    """What the covariance of lens parameters that were not fitted adds."""
+    """Additional covariance by lens parameters that were not fitted."""
     shared = []
     for x, b in zip(linear, blocks, strict=True):
         by_lens = x.by_lens / bundle.sigma_px
@@ -371,7 +367,7 @@ def _left_out(
     reduced: Sequence[tuple[Array, Array]],
     information: Array,
 ) -> Array:
-    """RMS [px] of each view under the fit to all others, as tracked (n,); to first order."""
+    """RMS [px] of each view as tracked (n,), with the fit to all other views; to first order."""
     rms = []
     for x, error, (own, gradient) in zip(linear, state.errors, reduced, strict=True):
         step = np.linalg.lstsq(information - own, gradient, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""Hand-eye calibration as a bundle: errors of all views, their derivatives, the tracker's share of them."""
+"""Hand-eye calibration as a bundle adjustment: errors of all views, derivatives, and tracker errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ from knee_gap_perception.calibrate.solvers.bundle import Block, block
 from knee_gap_perception.camera.projection import LensModel, Projection
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis, about, roll
 
-SAME_TURN = np.radians(3.0)  # scope turns that the closed-form solvers may treat as one
-KNOWN_TURN = 1e-7  # [rad] standard error of a turn that is taken as known
-RATIO_SIGMA = 1.0  # [-] how far the logarithm of turn over shift may stray from the presumed
+SAME_TURN = np.radians(3.0)  # range of scope rotations that the closed-form solvers treat as one
+KNOWN_TURN = 1e-7  # [rad] standard error of a rotation that is treated as exact
+RATIO_SIGMA = 1.0  # [-] prior standard deviation of the logarithm of rotation error over shift error
 
 
 class TrackedView(NamedTuple):
     """A board in an image and the tracked body at the same time.
 
-    `twist_rate` (6,) is the body's velocity in its own frame [rad/s, m/s]; `scope_rotation` [rad] the turn of
-    an oblique scope in its camera head since the reference, 0 where it is fixed, `turn_sigma` the error of
-    that.
+    `twist_rate` (6,) is the body's velocity in its own frame [rad/s, m/s]. `scope_rotation` [rad] is the
+    rotation of an oblique scope in its camera head since the reference, 0 if it is fixed, and `turn_sigma`
+    its standard error.
     """
 
     board: BoardView
@@ -35,7 +35,7 @@ class TrackedView(NamedTuple):
 
 
 class HandEyeState(NamedTuple):
-    """All that the fit may change; `errors` (n, 7) of each view are a twist of the body and a turn."""
+    """All unknowns of the fit; `errors` (n, 7) of each view are a twist of the body and a rotation."""
 
     T_body_lens: Array
     T_world_board: Array
@@ -46,7 +46,7 @@ class HandEyeState(NamedTuple):
 
 
 class LinearView(NamedTuple):
-    """One view about a state: residual (2n,) [px], derivatives by shared unknowns, lens and errors."""
+    """One view at a state: residual (2n,) [px], derivatives by shared unknowns, lens and errors."""
 
     residual: Array
     by_shared: Array
@@ -96,7 +96,7 @@ class HandEyeBundle:
         )
 
     def cost(self, state: HandEyeState) -> float:
-        """Sum of squares; infinite where a point cannot be projected."""
+        """Sum of squares; infinite if a point cannot be projected."""
         with np.errstate(all="ignore"):
             errors = [
                 self._seen(i, state).projection.pixels - v.board.pixels for i, v in enumerate(self.views)
@@ -173,7 +173,7 @@ class HandEyeBundle:
 
 
 class _Seen(NamedTuple):
-    """A view under a state: the turn of the scope, and its points in body, turned body and lens."""
+    """A view at a state: rotation of the scope, and the points in the body, rotated body and lens frames."""
 
     projection: Projection
     turn: float
@@ -184,12 +184,12 @@ class _Seen(NamedTuple):
 
 
 def needs_axis(views: Sequence[TrackedView], mount: Mount) -> bool:
-    """Whether the scope is turned in a camera head that carries the tracked body."""
+    """Whether the scope rotates in a camera head to which the tracked body is fixed."""
     return mount is Mount.CAMERA_HEAD and float(np.ptp([view.scope_rotation for view in views])) > SAME_TURN
 
 
 def _across(direction: Array) -> Array:
-    """Two unit vectors (3, 2) across a direction."""
+    """Two unit vectors (3, 2) perpendicular to a direction."""
     return np.asarray(np.linalg.svd(direction[None])[2][1:].T)
 
 
@@ -206,7 +206,7 @@ def _by_axis(from_axis: Array, direction: Array, turn: float) -> Array:
 
 
 def tracker_sigma(bundle: HandEyeBundle, state: HandEyeState, presumed: Array) -> Array:
-    """Restricted maximum likelihood of the tracker's error (6,): multiples of the presumed turn and shift."""
+    """Restricted maximum likelihood of the tracker's error (6,): multiples of the prior errors."""
     pixels = [
         block(x.residual - x.by_error @ e, x.by_shared, x.by_error)
         for x, e in ((bundle.linear(i, state), state.errors[i]) for i in range(len(bundle.views)))
@@ -227,7 +227,7 @@ def tracker_sigma(bundle: HandEyeBundle, state: HandEyeState, presumed: Array) -
         cost -= float(gradient @ np.linalg.solve(information, gradient))
         cost += float(np.linalg.slogdet(information / np.outer(scale, scale))[1])
         cost += 2 * float(np.log(scale).sum())
-        # Few views cannot tell a turn from a shift; the presumed ratio then decides.
+        # Few views cannot separate rotation from shift; the prior ratio then decides.
         return float(cost + ((log_scale[0] - log_scale[1]) / RATIO_SIGMA) ** 2)
 
     start = np.log([bundle.pose_sigma[0] / presumed[0], bundle.pose_sigma[3] / presumed[3]])
@@ -239,7 +239,7 @@ def tracker_sigma(bundle: HandEyeBundle, state: HandEyeState, presumed: Array) -
 
 
 def _scaled(pixels: Block, variance: float, error_sigma: Array) -> Block:
-    """Normal equations with the variance of a pixel, and what is known of the errors beforehand."""
+    """Normal equations with the variance of a pixel and the prior of the errors."""
     return Block(
         pixels.square / variance,
         pixels.shared / variance,

@@ -1,7 +1,7 @@
-"""Focal lengths, principal point and distortion of the lens from views of a board, with their covariance.
+"""Calibration of the intrinsics: focal lengths, principal point and distortion with covariance, from a board.
 
-Zhang's plane method as a bundle adjustment (Levenberg-Marquardt, the poses eliminated by a Schur complement),
-started from the focal length that explains the views best, so that no guess is asked of the user.
+It is Zhang's plane method as a bundle adjustment (Levenberg-Marquardt, the poses eliminated by a Schur
+complement), started from the best of several focal lengths, so that the user does not have to guess one.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,16 +22,16 @@ from knee_gap_perception.errors import PerceptionError
 MIN_VIEWS = 4
 MIN_TILT = np.radians(
     15.0
-)  # between the most different board normals; less leaves focal length and depth mixed
-MIN_COVERAGE = 0.25  # of the picture's height and width that the points must span
+)  # between the most different board normals; with less, focal length and depth cannot be separated
+MIN_COVERAGE = 0.25  # least fraction of the image's height and width that the points span
 OUTLIER_SIGMAS = 5.0
 OUTLIER_FLOOR_PX = 0.3
-CORRELATION_RANGE = 8  # spacings of the points over which their errors may agree
+CORRELATION_RANGE = 8  # spacings of the points over which their errors may be correlated
 
 
 @dataclass(frozen=True)
 class IntrinsicsFit:
-    """The lens, and the views it was fitted to, without their outliers, and T_lens_board of each."""
+    """The lens, the views it was fitted to without outliers, and T_lens_board of each."""
 
     intrinsics: Intrinsics
     views: tuple[BoardView, ...]
@@ -49,13 +49,13 @@ def fit_intrinsics(
 ) -> IntrinsicsFit:
     """Fit a lens to views of one flat board.
 
-    Raises PerceptionError, saying what to record instead, for too few views, views all from one side, and
-    points in a small part of the picture only.
+    Raises PerceptionError with advice on the recording for too few views, views all from one side, and points
+    in a small part of the image only.
     """
     usable = [view for view in views if len(view.ids) >= MIN_POINTS]
     _check_views(usable, len(views))
     parameters = _start(usable, width_px, height_px, model)
-    # By so rough a lens a view at the border of the picture may have no pose to begin from.
+    # With the initial lens, a view at the border of the image may not have an initial pose.
     usable = [view for view in usable if tells_pose(view, parameters, model)]
     _check_views(usable, len(views))
     poses = np.array([board_pose(view, parameters, model) for view in usable])
@@ -73,7 +73,7 @@ def fit_intrinsics(
 
 
 def tells_pose(view: BoardView, parameters: Array, model: LensModel) -> bool:
-    """Whether a view's points allow a pose of the board."""
+    """Whether a view's points determine a pose of the board."""
     try:
         board_pose(view, parameters, model)
     except PerceptionError:
@@ -82,9 +82,9 @@ def tells_pose(view: BoardView, parameters: Array, model: LensModel) -> bool:
 
 
 def board_pose(view: BoardView, parameters: Array, model: LensModel) -> Array:
-    """`T_lens_board` (4, 4) that shows the board's points at the view's pixels best.
+    """`T_lens_board` (4, 4) with the least reprojection error of the view.
 
-    Raises PerceptionError where the points allow no pose.
+    Raises PerceptionError if the points do not determine a pose.
     """
     plane = model.plane(view.pixels, parameters)
     found, rotation, translation = False, None, None
@@ -94,10 +94,10 @@ def board_pose(view: BoardView, parameters: Array, model: LensModel) -> Array:
         )
     if found and rotation is not None and translation is not None:
         T_lens_board = from_vector(np.concatenate([rotation.ravel(), translation.ravel()]))
-        # The points are before the lens; the board's origin, which need not be seen, may lie behind it.
+        # The points are in front of the lens; the board's origin need not be visible and may be behind it.
         if (apply(T_lens_board, view.points)[:, 2] > 0).all():
             return T_lens_board
-    raise PerceptionError(f"the board's pose cannot be told from {len(view.ids)} points")
+    raise PerceptionError(f"{len(view.ids)} points do not determine the pose of the board")
 
 
 def _check_views(usable: Sequence[BoardView], offered: int) -> None:
@@ -116,22 +116,20 @@ def _check_geometry(
     parameters: Array,
     model: LensModel,
 ) -> None:
-    # The angle between viewing ray and normal is what the eye calls tilt; normals alone miss pure pans.
+    # Tilt is the angle between viewing ray and normal; normals alone would not show a pure pan.
     normals = poses[:, :3, 2]
     tilt = float(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
     if tilt < MIN_TILT:
         raise PerceptionError(
-            f"all views show the board from the same side: its normal turns by {np.degrees(tilt):.1f} deg, "
-            "at least "
-            f"{np.degrees(MIN_TILT):.0f} deg are needed: tilt the scope to the left, right, up and down"
+            f"all views show the board from the same side: its normal rotates by {np.degrees(tilt):.1f} deg; "
+            f"at least {np.degrees(MIN_TILT):.0f} deg are needed: tilt the scope left, right, up and down"
         )
     pixels = np.concatenate([view.pixels for view in views])
     span = np.ptp(pixels, axis=0) / min(width_px, height_px)
     if span.min() < MIN_COVERAGE:
         raise PerceptionError(
-            f"the board covers {100 * span.min():.0f} % of the picture; at least {100 * MIN_COVERAGE:.0f} "
-            "% are "
-            "needed: show it close and in every part of the picture"
+            f"the board covers {100 * span.min():.0f} % of the image; at least {100 * MIN_COVERAGE:.0f} % "
+            "are needed: show it close and in every part of the image"
         )
 
 
@@ -152,7 +150,7 @@ def _start(views: Sequence[BoardView], width_px: int, height_px: int, model: Len
         if np.isfinite(rms) and (best is None or rms < best[0]):
             best = rms, parameters
     if best is None:
-        raise PerceptionError("no focal length explains the views: is --board the board in the picture?")
+        raise PerceptionError("no focal length fits the views: is --board the board in the images?")
     return best[1]
 
 
@@ -210,7 +208,7 @@ class _Bundle:
 def _without_outliers(
     views: Sequence[BoardView], parameters: Array, poses: Array, model: LensModel
 ) -> tuple[list[BoardView], Array, int]:
-    """The views without points far off a robust estimate of the spread, and how many were left out."""
+    """The views without outlying points, by a robust standard deviation, and the number of outliers."""
     lengths = [
         np.linalg.norm(_residuals(view, pose, parameters, model), axis=1)
         for view, pose in zip(views, poses, strict=True)
@@ -271,7 +269,7 @@ def bias_of(views: Sequence[BoardView]) -> float:
 
 
 def systematic(parameter_count: int, bias_px: float) -> Array:
-    """Covariance (m, m) of the lens from what no residual shows: a bias of points, alike in all views."""
+    """Covariance (m, m) of the lens by a bias of the points common to all views, which no residual shows."""
     sigma = np.zeros(parameter_count)
     # Half the field of view is about half a radian: a bias there moves the focal length by twice as much.
     sigma[:4] = 2 * bias_px, 2 * bias_px, bias_px, bias_px
@@ -279,12 +277,12 @@ def systematic(parameter_count: int, bias_px: float) -> Array:
 
 
 def design_effect(views: Sequence[BoardView], residuals: Sequence[Array]) -> float:
-    """How many times a mean over points varies more than if their errors were independent; at least 1.
+    """Design effect: variance of a mean over points, relative to that with independent errors; at least 1.
 
-    1 + the sum of the correlations with all neighbours, out to the distance, counted in spacings of the
-    points, at which they are no longer clearly above zero. Errors of neighbours agree where the lens differs
-    from its model, the board is not flat or the picture is blurred; then many points tell little more than a
-    few.
+    It is 1 + the sum of the correlations with all neighbours, up to the distance, in spacings of the points,
+    at which they are not clearly above zero any more. Errors of neighbours are correlated if the lens differs
+    from its model, the board is not flat or the image is blurred; many points then carry little more
+    information than a few.
     """
     sums, pairs, square, points = np.zeros(CORRELATION_RANGE), np.zeros(CORRELATION_RANGE), 0.0, 0
     for view, residual in zip(views, residuals, strict=True):

@@ -1,4 +1,4 @@
-"""What an imperfect calibration and tracker do to two views: bounds that `gap_range` takes."""
+"""Bounds of the lens pose errors in two views, due to calibration and tracker, for `gap_range`."""
 
 from typing import Protocol
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 
-COVERAGE_FACTOR = 3.0  # standard deviations that count as a bound
+COVERAGE_FACTOR = 3.0  # standard deviations of a bound
 
 
 class LensError(Protocol):
-    """What is known of the lens on its body: `calibration_file.LensOnBody` and `hand_eye.HandEye` alike."""
+    """Interface of the lens on its body: `calibration_file.LensOnBody` and `hand_eye.HandEye`."""
 
     @property
     def T_body_lens(self) -> Array:  # noqa: N802 - frames are in the name
@@ -18,7 +18,7 @@ class LensError(Protocol):
 
     @property
     def covariance(self) -> Array:
-        """Of the twist of T_body_lens (6, 6), rotation first."""
+        """Covariance of the twist of T_body_lens (6, 6), rotation first."""
 
     @property
     def rotation_error(self) -> float:
@@ -32,9 +32,9 @@ class LensError(Protocol):
 def lens_covariance(T_world_body_0: Array, T_world_body_1: Array, lens: LensError) -> tuple[Array, Array]:
     """Covariances (3, 3) of the lens position [m^2] and rotation [rad^2] in the world, for two views.
 
-    The part of the calibration's error that both views share moves the triangle as a whole and is left out:
-    of the lens's position on the body only (R_1 - R_0) is felt, half of it at each view. Its rotation counts
-    in full.
+    The part of the calibration's error that both views share moves the triangle as a whole and is left out.
+    Of the lens's position on the body only (R_1 - R_0) has an effect, half of it at each view. Its rotation
+    counts in full.
     """
     per_axis = np.array([lens.rotation_error, lens.translation_error]) ** 2 / 3
     arm = T_world_body_1[:3, :3] @ lens.T_body_lens[:3, 3]

@@ -1,6 +1,6 @@
-"""Tip of the scope on its body, by turning the scope about the tip while the tip stays in place.
+"""Pivot calibration: position of the scope's tip on its body, from rotations about the stationary tip.
 
-Every pose says R tip + t = pivot, which is linear in both points (the algebraic one-step method; Yaniv 2015).
+Every pose gives R tip + t = pivot, linear in both points (the algebraic one-step method; Yaniv 2015).
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ BLOCK_POSES = 100
 class Pivot:
     """`tip` (3,) [m] in the body's frame, its covariance (3, 3) [m^2], and the `pivot` (3,) [m] in the world.
 
-    `rms` [m] is the RMS distance between the pivot and where the poses put the tip.
+    `rms` [m] is the RMS distance between the pivot and the tip by the poses.
     """
 
     tip: Array
@@ -37,7 +37,7 @@ class Pivot:
 def calibrate_pivot(T_world_body: npt.ArrayLike) -> Pivot:
     """Tip and pivot from poses (n, 4, 4) of a body that pivots.
 
-    Raises PerceptionError, saying what to do instead, for too few poses and for pivoting without rotation.
+    Raises PerceptionError with advice for too few poses and for pivoting without rotation.
     """
     T = np.asarray(T_world_body, dtype=np.float64)
     T = T[np.isfinite(T).all(axis=(1, 2))]
@@ -60,17 +60,15 @@ def calibrate_pivot(T_world_body: npt.ArrayLike) -> Pivot:
 
 
 def _check_rotation(T: Array) -> None:
-    """Two axes are needed: turning about one leaves the tip anywhere along it."""
+    """Raise PerceptionError without rotation about two axes: the tip is undetermined along a single axis."""
     rotations = Rotation.from_matrix(T[:, :3, :3])
     vectors = (rotations.mean().inv() * rotations).as_rotvec()
     turn = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(T))
     if turn[1] < MIN_TURN:
         raise PerceptionError(
-            f"pivoting needs rotation: the scope turns by {np.degrees(turn[0]):.1f} deg (RMS) about one "
-            "axis and "
-            f"{np.degrees(turn[1]):.1f} deg about a second; at least {np.degrees(MIN_TURN):.0f} deg about "
-            "both are "
-            "needed: rest the tip in a dimple and swing the handle in wide circles"
+            f"pivoting needs rotation: the scope rotates by {np.degrees(turn[0]):.1f} deg (RMS) about one "
+            f"axis and {np.degrees(turn[1]):.1f} deg about a second; at least {np.degrees(MIN_TURN):.0f} deg "
+            "about both are needed: rest the tip in a dimple and swing the handle in wide circles"
         )
 
 
@@ -80,7 +78,7 @@ def _solve(T: Array) -> Array:
 
 
 def _result(T: Array, solution: Array, residual: Array, outliers: int) -> Pivot:
-    """Covariance by blocks of poses: what holds the tip badly lasts longer than one sample."""
+    """Covariance by blocks of poses, since a slip of the tip lasts longer than one sample."""
     blocks = np.array_split(np.arange(len(T)), min(len(T), int(np.clip(len(T) // BLOCK_POSES, 8, 40))))
     design = np.concatenate([T[:, :3, :3], np.broadcast_to(-np.eye(3), (len(T), 3, 3))], axis=2)
     information = np.einsum("nki,nkj->ij", design, design)

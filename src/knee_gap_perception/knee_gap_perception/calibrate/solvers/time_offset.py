@@ -1,14 +1,16 @@
-"""Time between the clocks of video and tracker, from the motion that both see; no board is needed.
+"""Time offset between video and tracker, from the motion that both observe, without a board.
 
-Whatever the lens, the scene and where the lens sits on the body: the affine flow of the picture is a linear
-function of the body's motion between the two exposures, with coefficients that change only as fast as the
-scene's depth does. So for each trial offset the flow is regressed on the tracked motion, window by window,
-and the offset that leaves the smallest residual wins. That is done with coefficients that change linearly and
-quadratically with time within a window, and with windows that begin at two phases; the answer is the mean of
-the four, and how far they differ is part of the standard error. The rest of it is by what the residuals are:
-errors of the tracker, whose every pose is in two increments, and of the coefficients, which last for a
-while. So derivatives are summed over stretches before they are squared. Leaving out one window in turn, of
-which there are few, gave a standard error that was itself off by half.
+For any lens, scene and pose of the lens on the body, the affine flow of the image is a linear function of the
+body's motion between the two exposures. Its coefficients change only as fast as the depth of the scene. So
+for each trial offset, the flow is regressed on the tracked motion, window by window, and the offset with the
+smallest residual is chosen.
+
+This is done with coefficients that change linearly and quadratically with time within a window, and with
+windows that begin at two phases. The result is the mean of the four, and their variance is part of the
+standard error. The other part comes from the residuals: errors of the tracker, in which each pose is part of
+two increments, and errors of the coefficients, which persist for some time. So derivatives are summed over
+stretches before they are squared. A jackknife over the windows, of which there are few, gave a standard error
+that was itself wrong by half.
 """
 
 from dataclasses import dataclass, replace
@@ -26,13 +28,11 @@ from knee_gap_perception.errors import PerceptionError
 WINDOW = 2.0  # [s] for one regression
 MIN_PAIRS = 40  # in a window: its 18 coefficients would fit fewer too well
 DEGREES = (1, 2)  # of the coefficients' change with time
-PHASES = (0.0, 0.5)  # of the windows' begin, in windows
-STRETCH = 0.5  # [s] over which residuals may hang together
-SMALL_SHIFT = 5e-4  # [s] over which the residuals change evenly
+PHASES = (0.0, 0.5)  # start of the windows, in lengths of a window
+STRETCH = 0.5  # [s] over which residuals may be correlated
+SMALL_SHIFT = 5e-4  # [s] step of the numerical derivatives
 MIN_WINDOWS = 5
-MIN_LEAD = (
-    3.0  # how much less must be left at the best offset than at most others; unrelated motion gives 1.2
-)
+MIN_LEAD = 3.0  # least ratio of the median residual to the one at the best offset; unrelated motion gives 1.2
 SCAN_STEP = 0.004  # [s]
 
 
@@ -40,9 +40,8 @@ SCAN_STEP = 0.004  # [s]
 class TimeOffset:
     """`offset` [s]: the tracker's clock reads stamp + offset at the exposure of an image with that stamp.
 
-    `sigma` is its standard error. `explained` is the share of the
-    picture's motion that the tracked motion explains; `scan` (n, 2) the trial offsets [s] and the share that
-    each leaves.
+    `sigma` is its standard error. `explained` is the fraction of the image motion that the tracked motion
+    explains; `scan` (n, 2) are the trial offsets [s] and the unexplained fraction of each.
     """
 
     offset: float
@@ -55,8 +54,8 @@ class TimeOffset:
 def estimate_time_offset(motion: ImageMotion, track: PoseTrack, *, max_offset: float = 0.25) -> TimeOffset:
     """Offset between the clocks of images and poses, searched within +- `max_offset` [s].
 
-    Raises PerceptionError, saying what to record instead, for too little common recording, pictures that do
-    not move as the body does, and an optimum at the edge of the search.
+    Raises PerceptionError with advice on the recording if the common recording is too short, if the images do
+    not move with the body, or if the optimum is at the edge of the search.
     """
     reach_ns = int((max_offset + 0.05) * 1e9)
     inside = track.covers(motion.start_ns - reach_ns) & track.covers(motion.end_ns + reach_ns)
@@ -65,30 +64,26 @@ def estimate_time_offset(motion: ImageMotion, track: PoseTrack, *, max_offset: f
     if len(windows) < MIN_WINDOWS:
         raise PerceptionError(
             f"{len(pairs.flow)} pairs of images show motion while the body is tracked, which fill "
-            f"{len(windows)} windows "
-            f"of {WINDOW:g} s; at least {MIN_WINDOWS} are needed: record 15 s of a textured scene at 20 "
-            "images a second or "
-            "more while the scope is shaken"
+            f"{len(windows)} windows of {WINDOW:g} s; at least {MIN_WINDOWS} are needed: record 15 s of a "
+            "textured scene at 20 images per second or more while the scope is shaken"
         )
     steps = np.arange(-max_offset, max_offset + SCAN_STEP / 2, SCAN_STEP)
     residuals = _Residuals(pairs, track, windows, np.ones(6), DEGREES[0])
     coarse = np.array([residuals(step).sum() for step in steps])
-    # Components of the flow that the motion explains less well count less, once the offset is roughly known.
+    # Once the offset is roughly known, components of the flow that fit the motion less well get less weight.
     residuals = residuals.weighted(float(steps[coarse.argmin()]))
     scan = np.array([residuals(step).sum() for step in steps]) / residuals.total
     best = int(scan.argmin())
     lead = float(np.median(scan) / scan[best])
     if lead < MIN_LEAD:
         raise PerceptionError(
-            f"the picture's motion fits the tracked one at {1e3 * steps[best]:+.0f} ms only {lead:.1f} "
-            "times better than at "
-            f"other offsets; at least {MIN_LEAD:g} times are needed: shake the scope more, two or three "
-            "times a second, "
-            "and look at something that stands still"
+            f"the image motion fits the tracked motion at {1e3 * steps[best]:+.0f} ms only {lead:.1f} times "
+            f"better than at other offsets; at least {MIN_LEAD:g} times are needed: shake the scope more, "
+            "two or three times per second, in front of a stationary scene"
         )
     if best in (0, len(steps) - 1):
         raise PerceptionError(
-            f"the clocks agree best at the edge of the search, {steps[best]:+.3f} s: search further than "
+            f"the best offset is at the edge of the search, {steps[best]:+.3f} s: set --max-offset above "
             f"{max_offset} s"
         )
     offsets, variances = [], []
@@ -118,7 +113,7 @@ def _windows(pairs: ImageMotion, phase: float) -> list[npt.NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Squared flow that the tracked motion leaves in each window, as a function of the offset."""
+    """Squared flow in each window that the tracked motion does not explain, as a function of the offset."""
 
     pairs: ImageMotion
     track: PoseTrack
@@ -147,18 +142,18 @@ class _Residuals:
 
     @property
     def total(self) -> float:
-        """Weighted sum of squares before anything is explained."""
+        """Weighted sum of squares of the flow itself."""
         return float(sum(((self.pairs.flow[window] * self.weight) ** 2).sum() for window in self.windows))
 
     def weighted(self, offset: float) -> "_Residuals":
-        """The same with each component weighted by what it leaves at an offset."""
+        """The same, with each component weighted by its residual at an offset."""
         left = np.concatenate(self._parts(offset))
         return replace(self, weight=self.weight / np.maximum(left.std(axis=0), 1e-9))
 
     def variance(self, offset: float) -> float:
-        """Of the offset of the smallest residual [s^2].
+        """Variance of the offset of the smallest residual [s^2].
 
-        By the sandwich formula, with what the coefficients have taken up of the residuals given back.
+        By the sandwich formula, corrected for the part of the residuals that the coefficients absorb.
         """
         left = np.concatenate(self._parts(offset))
         later, earlier = self._parts(offset + SMALL_SHIFT), self._parts(offset - SMALL_SHIFT)

@@ -1,1 +1,1 @@
-"""OptiTrack's NatNet protocol: packets, session, clock, client."""
+"""Client of OptiTrack's NatNet protocol: packets, session, clock, sockets."""

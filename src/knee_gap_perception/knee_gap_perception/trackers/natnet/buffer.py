@@ -1,8 +1,8 @@
-"""Bytes of one NatNet packet, read front to back and never beyond the end.
+"""Bounds-checked buffer of one NatNet packet, for reading from front to back.
 
-The message classes of the `natnet` package read through its buffer, which believes every length in a packet:
-a damaged one makes it ask for gigabytes, or loop for hours over empty names. This buffer refuses at the first
-read that the packet cannot hold, so that the work is bounded by the packet's own size.
+The message classes of the `natnet` package read through its own buffer, which trusts every length in a
+packet: a damaged one makes it allocate gigabytes, or loop for hours over empty names. This buffer raises at
+the first read beyond the packet's end, so that the work is bounded by the packet's size.
 """
 
 import struct
@@ -14,25 +14,25 @@ from knee_gap_perception.errors import PerceptionError
 
 
 class PacketError(PerceptionError):
-    """A packet that is not what its header or the protocol's version says."""
+    """A packet that does not match its header or the protocol's version."""
 
 
 class BoundedBuffer(PacketBuffer):
-    """The reading side of `natnet`'s message classes, little-endian and within the packet."""
+    """The reading interface of `natnet`'s message classes, little-endian and bounds-checked."""
 
     @property
     def remaining(self) -> int:
-        """Bytes that are left to read."""
+        """Number of bytes left to read."""
         return len(self.data) - int(self.pointer)
 
     def skip(self, count: int) -> None:
-        """Pass over some bytes."""
+        """Skip some bytes."""
         if not 0 <= count <= self.remaining:
             raise PacketError(f"the packet ends {count - self.remaining} bytes too early")
         self.pointer += count
 
     def read(self, data_type: struct.Struct | str) -> tuple[Any, ...]:
-        """Read what a struct format says."""
+        """Read the values of a struct format."""
         layout = struct.Struct("<" + data_type) if isinstance(data_type, str) else data_type
         start = self.pointer
         self.skip(layout.size)
@@ -43,9 +43,9 @@ class BoundedBuffer(PacketBuffer):
         return int(self.read("Q")[0])
 
     def read_float32_array(self, count: int) -> tuple[float, ...]:
-        """Read `count` numbers, refused before anything of that size is made."""
+        """Read `count` numbers; the size is checked before the memory is allocated."""
         if 4 * count > self.remaining:
-            raise PacketError(f"the packet says {count} numbers follow, and {self.remaining} bytes are left")
+            raise PacketError(f"{count} numbers are announced, but only {self.remaining} bytes are left")
         return self.read(f"{count}f")
 
     def read_string(self, max_length: int | None = None, static_length: bool = False) -> str:

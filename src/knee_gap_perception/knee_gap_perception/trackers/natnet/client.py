@@ -1,4 +1,4 @@
-"""NatNet over UDP: the sockets and clocks around a session."""
+"""NatNet client over UDP: sockets and clocks around a session."""
 
 import select
 import socket
@@ -15,23 +15,23 @@ from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus
 from knee_gap_perception.trackers.natnet.session import NatNetSession
 
 MAX_PACKET_BYTES = 65_536
-# Packets read in one call, so that a flood cannot keep the caller.
+# Most packets read in one call, so that a flood does not block the caller.
 MAX_PACKETS = 512
 RECEIVE_BUFFER_BYTES = 1 << 20
-# Between two looks at what is due to be sent [s].
+# Interval between two checks for requests to be sent [s].
 STEP = 0.01
 
 
 @dataclass(frozen=True)
 class NatNetParameters:
-    """Where Motive is and how it sends. Raises PerceptionError for values outside their range."""
+    """Address and transmission of Motive. Raises PerceptionError for values outside their range."""
 
     server_address: str = field(
         default="127.0.0.1", metadata={"description": "Address of the machine that runs Motive"}
     )
     local_address: str = field(
         default="",
-        metadata={"description": "Address of this machine's interface to Motive; empty finds it"},
+        metadata={"description": "Address of this machine's interface to Motive; empty: automatic"},
     )
     command_port: int = field(
         default=1510, metadata={"description": "UDP port of Motive for commands", "range": (1, 65535)}
@@ -39,7 +39,7 @@ class NatNetParameters:
     transmission: str = field(
         default="auto",
         metadata={
-            "description": "How Motive sends; auto asks the server (NatNet 3.0 and later)",
+            "description": "Transmission of Motive; auto asks the server (NatNet 3.0 and later)",
             "choices": ("auto", "unicast", "multicast"),
         },
     )
@@ -57,8 +57,8 @@ class NatNetParameters:
     max_clock_error: float = field(
         default=0.001,
         metadata={
-            "description": "Largest bound on the error of the time of exposure, half of an echo's time [s]; "
-            "frames are not used before it is reached",
+            "description": "Largest error bound of the time of exposure, half of an echo's duration [s]; "
+            "frames are not used until it is reached",
             "range": (1e-5, 0.1),
         },
     )
@@ -68,12 +68,12 @@ class NatNetParameters:
 
 
 class NatNetClient:
-    """Receives frames from Motive; a `BodySource`. Never blocks for longer than asked to.
+    """Receives frames from Motive; a `BodySource`. It never blocks longer than the given timeout.
 
     One thread may poll while another asks for the status.
 
-    `ros_now` gives the time of ROS [ns]; stamps follow it when it steps. `up_axis` is that of Motive's
-    stream. Raises PerceptionError for an address that is none or that this machine does not have.
+    `ros_now` gives the ROS time [ns]; stamps follow its steps. `up_axis` is that of Motive's stream. Raises
+    PerceptionError for an invalid address or one that this machine does not have.
     """
 
     waits = True
@@ -90,7 +90,7 @@ class NatNetClient:
         self._ros_now = ros_now
         server = _resolved(self.parameters.server_address)
         self._server = (server, self.parameters.command_port)
-        # No packet chooses what is listened to.
+        # The addresses to receive from are never taken from a packet.
         self._group = (self.parameters.multicast_address, self.parameters.data_port)
         self.session = NatNetSession(
             server,
@@ -104,7 +104,7 @@ class NatNetClient:
         self._data: socket.socket | None = None
         self._joined = False
         self._send_fault = ""
-        # One thread receives, another asks how it fares.
+        # One thread receives, another asks for the status.
         self._lock = threading.Lock()
         if self.parameters.transmission == "multicast":
             self._join()
@@ -118,9 +118,9 @@ class NatNetClient:
         self.close()
 
     def poll(self, timeout: float = 0.0) -> list[BodyFrame]:
-        """Return the frames that came since the last call; waits up to `timeout` [s] for the first."""
+        """Return the frames received since the last call; wait up to `timeout` [s] for the first."""
         end = time.monotonic() + timeout
-        # What waits is read first: after a pause of this process the server must not be taken for gone.
+        # Waiting packets are read first: after a pause of this process, the server must not count as lost.
         frames = self._receive(0.0)
         while True:
             self._send_due()
@@ -130,7 +130,7 @@ class NatNetClient:
             frames = self._receive(min(left, STEP))
 
     def status(self) -> SourceStatus:
-        """Return how the connection fares, in plain words."""
+        """Return the status of the connection."""
         with self._lock:
             status = self.session.status(time.monotonic_ns())
         if self._send_fault and not status.ok:
@@ -151,7 +151,7 @@ class NatNetClient:
                 self._command.sendto(request, self._server)
                 self._send_fault = ""
             except OSError as error:
-                # The network may come back; until then the status tells.
+                # The network may come back; until then the status reports it.
                 self._send_fault = error.strerror or str(error)
 
     def _receive(self, timeout: float) -> list[BodyFrame]:
@@ -177,7 +177,7 @@ class NatNetClient:
         return frames
 
     def _ros_offset_ns(self) -> int:
-        """Time of ROS minus monotonic time, by the reading that was interrupted least."""
+        """ROS time minus monotonic time, by the fastest of several readings."""
         readings = []
         for _ in range(3):
             before = time.monotonic_ns()
@@ -187,7 +187,7 @@ class NatNetClient:
         return min(readings)[1]
 
     def _follow_transmission(self) -> None:
-        """Listen to the multicast group that was set, if the server sends that way or does not say how."""
+        """Join the configured multicast group, if the server sends by multicast or its way is unknown."""
         info = self.session.info
         if self.parameters.transmission == "auto" and info is not None and info.multicast is not False:
             self._join()
@@ -209,11 +209,11 @@ def _resolved(address: str) -> str:
     try:
         return socket.gethostbyname(address)
     except OSError:
-        raise PerceptionError(f"server_address '{address}' is no address that is known here") from None
+        raise PerceptionError(f"server_address '{address}' cannot be resolved") from None
 
 
 def _route_to(server: tuple[str, int]) -> str:
-    """Address of the interface from which packets to the server leave."""
+    """Address of the interface used for packets to the server."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(server)

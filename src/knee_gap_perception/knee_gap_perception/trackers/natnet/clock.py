@@ -1,4 +1,4 @@
-"""The server's clock on ours: echoes bound when its ticks were; the best give offset and rate."""
+"""Clock synchronisation with a NatNet server: offset and rate of its ticks from echoes."""
 
 from collections import deque
 from typing import NamedTuple
@@ -7,21 +7,21 @@ import numpy as np
 
 from knee_gap_core.values.stamps import NANOSECONDS
 
-# Two crystals differ by no more than this share; over the time after which the rate is fitted [ns], 0.6 ms.
+# Largest relative rate difference of two crystals; 0.6 ms over the time after which the rate is fitted [ns].
 MAX_DRIFT = 2e-4
 RATE_KNOWN_AFTER_NS = 3 * NANOSECONDS
-# Without an echo for so long the clock is no longer trusted [ns].
+# Time without an echo after which the clock is not used any more [ns].
 MAX_AGE_NS = 60 * NANOSECONDS
-# Of fewer echoes, none may have been a quick one.
+# Least number of echoes: among fewer, there may be no quick one.
 FEWEST_ECHOES = 6
-# An echo that is this far outside of what the clock allows is of another clock: it is refused [ns].
+# An echo outside the clock's bounds by more than this belongs to another clock and is rejected [ns].
 OTHER_CLOCK_NS = 2_000_000
-# So many echoes in a row that are refused, and agree with each other, may mean that the server restarted.
+# Number of rejected echoes in a row, in agreement with each other, that may mean a restart of the server.
 FEWEST_OF_ANOTHER = 3
 
 
 class Echo(NamedTuple):
-    """The server's ticks were read at `local_ns`, give or take `error_ns`: half the time of the echo."""
+    """Server ticks read at `local_ns`, with the error bound `error_ns`: half the duration of the echo."""
 
     ticks: int
     local_ns: int
@@ -31,9 +31,9 @@ class Echo(NamedTuple):
 class EchoClock:
     """Maps ticks of the server's clock to the local monotonic clock [ns].
 
-    Each echo encloses the moment at which the server read its clock. Echoes that took little longer than the
-    quickest one are kept; a straight line through their middles gives offset and rate. An echo that
-    contradicts the clock is refused; `restart` follows a server that restarted.
+    Each echo bounds the time at which the server read its clock. Echoes that took little longer than the
+    quickest one are kept; a straight line through their midpoints gives offset and rate. An echo that
+    contradicts the clock is rejected; `restart` adopts the clock of a server that restarted.
     """
 
     def __init__(self, frequency: int, max_error_ns: float = 1_000_000) -> None:
@@ -41,7 +41,7 @@ class EchoClock:
         self.max_error_ns = max_error_ns
         self.restart_count = 0
         self._echoes: deque[Echo] = deque(maxlen=120)
-        # Echoes that were refused since the last one that was not.
+        # Echoes rejected since the last accepted one.
         self._refused: list[Echo] = []
         self._origin: Echo | None = None
         self._ns_per_tick = NANOSECONDS / frequency
@@ -49,11 +49,11 @@ class EchoClock:
 
     @property
     def error_ns(self) -> float:
-        """Bound on the error of the offset [ns]: half of the quickest echo; infinite before any."""
+        """Error bound of the offset [ns]: half the duration of the quickest echo; infinite before any."""
         return self._error_ns
 
     def ready(self, now_ns: int) -> bool:
-        """Whether ticks can be mapped to within `max_error_ns`: by some echoes, the last not long ago."""
+        """Whether ticks can be mapped to within `max_error_ns`, by enough echoes with a recent last one."""
         enough = len(self._echoes) >= FEWEST_ECHOES and self._error_ns <= self.max_error_ns
         return enough and now_ns - self._echoes[-1].local_ns <= MAX_AGE_NS
 
@@ -64,11 +64,11 @@ class EchoClock:
 
     @property
     def another(self) -> bool:
-        """Whether the echoes that were refused agree on another clock."""
+        """Whether the rejected echoes agree on another clock."""
         return len(self._refused) >= FEWEST_OF_ANOTHER
 
     def add(self, sent_ns: int, received_ns: int, ticks: int) -> bool:
-        """Take an echo that was sent and received at these local times; return whether it was not refused."""
+        """Add an echo that was sent and received at these local times; return whether it was accepted."""
         if received_ns < sent_ns:
             return False
         echo = Echo(ticks, (sent_ns + received_ns) // 2, (received_ns - sent_ns) / 2)
@@ -83,7 +83,7 @@ class EchoClock:
         return True
 
     def restart(self) -> None:
-        """Follow the clock of the echoes that were refused."""
+        """Adopt the clock of the rejected echoes."""
         self.restart_count += 1
         self._ns_per_tick = NANOSECONDS / self.frequency
         self._echoes.clear()
@@ -97,18 +97,18 @@ class EchoClock:
             expected = first.local_ns + (echo.ticks - first.ticks) * NANOSECONDS / self.frequency
             if abs(expected - echo.local_ns) > first.error_ns + echo.error_ns + OTHER_CLOCK_NS:
                 self._refused.clear()
-        # As many as make a clock that is ready.
+        # As many as a ready clock needs.
         self._refused = [*self._refused, echo][-FEWEST_ECHOES:]
 
     def local_ns(self, ticks: int) -> int:
-        """Local time of a tick; `ready` must hold, or at least one echo be known."""
+        """Local time of a tick. It needs `ready`, or at least one echo."""
         assert self._origin is not None
         return self._origin.local_ns + round((ticks - self._origin.ticks) * self._ns_per_tick)
 
     def _fit(self) -> None:
         latest = self._echoes[-1].local_ns
         best = min(self._echoes, key=lambda echo: echo.error_ns)
-        # An echo that took longer was delayed on one of its two ways, and its middle is off by that.
+        # An echo that took longer was delayed on one of its two ways, which shifts its midpoint.
         quick = [echo for echo in self._echoes if echo.error_ns <= 1.5 * best.error_ns + 20_000]
         if quick[-1].local_ns - quick[0].local_ns < RATE_KNOWN_AFTER_NS:
             recent = [echo for echo in self._echoes if latest - echo.local_ns < RATE_KNOWN_AFTER_NS]

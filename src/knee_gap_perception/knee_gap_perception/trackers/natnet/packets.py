@@ -1,10 +1,10 @@
-"""NatNet packets from and to bytes: pure functions, no sockets and no clocks.
+"""Decoding and encoding of NatNet packets: pure functions without sockets and clocks.
 
 A packet is a message number (uint16), the length of its payload (uint16) and the payload, little-endian.
-Positions are metres in Motive's axes (Y up unless set otherwise), quaternions x y z w. Read are the versions
-2.x, 3.x and 4.x, whose layout differs by version: the version that the server states must be known first. The
-elements of frames and of model definitions are read by the message classes of the `natnet` package, except
-where those are wrong: the last part of a frame (2.x and 4.1), the server's clock, and force plates.
+Positions are metres in Motive's axes (Y up unless set otherwise), quaternions x y z w. Versions 2.x, 3.x and
+4.x are decoded. Their layouts differ, so the server's version must be known first. The elements of frames and
+of model definitions are decoded by the message classes of the `natnet` package, except where those are wrong:
+the last part of a frame (2.x and 4.1), the server's clock, and force plates.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ class MessageId(IntEnum):
 
 
 class NatNetVersion(NamedTuple):
-    """Version of the protocol, as `3.0`."""
+    """Version of the protocol, such as `3.0`."""
 
     major: int
     minor: int
@@ -54,9 +54,9 @@ class NatNetVersion(NamedTuple):
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """What a server says of itself.
+    """Description of a server.
 
-    `clock_frequency` is that of its time stamps [Hz]; it, the data port and the way of transmission are None
+    `clock_frequency` is that of its time stamps [Hz]. It, the data port and the way of transmission are None
     before NatNet 3.0.
     """
 
@@ -78,7 +78,7 @@ class ModelDefinitions:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """One body of a frame; `tracking_valid` None where the version does not tell (before 2.6)."""
+    """One body of a frame; `tracking_valid` is None if the version does not have it (before 2.6)."""
 
     id: int
     position: tuple[float, ...]
@@ -89,7 +89,7 @@ class RigidBody:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame; the server's ticks of exposure and of sending are None before 3.0 and where 0."""
+    """One frame; the server's ticks of exposure and of sending are None before 3.0 and if they are 0."""
 
     number: int
     bodies: tuple[RigidBody, ...]
@@ -100,7 +100,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class EchoResponse:
-    """The client's own stamp, returned, and the server's ticks when it came by."""
+    """Echo response: the client's own stamp, and the server's ticks when it was received."""
 
     request_stamp: int
     server_ticks: int
@@ -108,24 +108,24 @@ class EchoResponse:
 
 @dataclass(frozen=True)
 class Unrecognized:
-    """The server does not know a request."""
+    """Response to a request that the server does not know."""
 
 
 Packet = ServerInfo | ModelDefinitions | Frame | EchoResponse | Unrecognized
 
 
 def decode_packet(data: bytes, version: NatNetVersion | None) -> Packet | None:
-    """Return what a packet says, or None for messages that do not matter here.
+    """Return the content of a packet, or None for messages that are not needed here.
 
     `version` is the server's, from its ServerInfo; without it, frames and model definitions are refused.
-    Raises PacketError, and nothing else, for whatever is not a packet of that version.
+    Raises PacketError, and nothing else, for any data that are not a packet of that version.
     """
     if len(data) < HEADER_BYTES:
         raise PacketError(f"a packet has at least {HEADER_BYTES} bytes, not {len(data)}")
     buffer = BoundedBuffer(data)
     message, length = buffer.read("HH")
     if length != buffer.remaining:
-        raise PacketError(f"the packet says {length} bytes follow, but {buffer.remaining} do")
+        raise PacketError(f"the packet announces {length} bytes, but contains {buffer.remaining}")
     if message == MessageId.SERVER_INFO:
         return _server_info(buffer)
     if message == MessageId.ECHO_RESPONSE:
@@ -135,10 +135,10 @@ def decode_packet(data: bytes, version: NatNetVersion | None) -> Packet | None:
     if message not in (MessageId.FRAME, MessageId.MODEL_DEFINITIONS):
         return None
     if version is None:
-        raise PacketError("data came before the server told its version")
+        raise PacketError("data were received before the server's version")
     if not 2 <= version.major <= 4:
         raise PacketError(
-            f"the server speaks NatNet {version}; 2.x to 4.x are read (choose the bitstream in Motive)"
+            f"the server uses NatNet {version}; 2.x to 4.x are supported (choose the bitstream in Motive)"
         )
     return _frame(buffer, version) if message == MessageId.FRAME else _model_definitions(buffer, version)
 
@@ -149,17 +149,17 @@ def encode_request(message: MessageId, payload: bytes = b"") -> bytes:
 
 
 def connect_request() -> bytes:
-    """The request that every version answers with a ServerInfo, and by which a unicast server starts to send.
+    """Connection request: every version answers it with a ServerInfo, and a unicast server starts to send.
 
     The payload is the sender's name (256 bytes), its version and its NatNet version (4 bytes each), and, from
-    4.0 on, the wish for a subset (no) and for another version (none).
+    4.0 on, whether a subset (no) or another version (none) is requested.
     """
     sender = b"knee_gap".ljust(256, b"\0") + bytes([1, 0, 0, 0]) + bytes([4, 1, 0, 0])
     return encode_request(MessageId.CONNECT, sender + bytes(5))
 
 
 def echo_request(stamp: int) -> bytes:
-    """The request that the server returns with its own clock's ticks."""
+    """Echo request, which the server returns with the ticks of its clock."""
     return encode_request(MessageId.ECHO_REQUEST, stamp.to_bytes(8, "little"))
 
 
@@ -172,13 +172,13 @@ def _server_info(buffer: BoundedBuffer) -> ServerInfo:
         return ServerInfo(application, application_version, version)
     frequency, port, multicast = buffer.read("QHB")
     if frequency == 0:
-        raise PacketError("the server says that its clock stands still (0 Hz)")
+        raise PacketError("the server's clock frequency is 0 Hz")
     group = ".".join(str(number) for number in buffer.read("4B"))
     return ServerInfo(application, application_version, version, frequency, port, bool(multicast), group)
 
 
 def _sized(version: NatNetVersion) -> bool:
-    """Whether each part of a packet states its length in bytes."""
+    """Whether each part of a packet contains its length in bytes."""
     return version >= (4, 1)
 
 
@@ -205,13 +205,13 @@ def _frame(buffer: BoundedBuffer, version: NatNetVersion) -> Frame:
 
 
 def _frame_end(buffer: BoundedBuffer, version: NatNetVersion) -> tuple[int, int, int]:
-    """Ticks of mid-exposure and of sending, and the flags, from what stands behind the data of a frame.
+    """Ticks of mid-exposure and of sending, and the flags, from the bytes after the data of a frame.
 
     An end mark of 4 bytes follows the flags, or nothing; some servers of 4.0 send a hardware clock's time as
-    well. What does not fit was not a frame of this version.
+    well. Any other length is not a frame of this version.
     """
     if version < (3, 0):
-        # Latency, timecode and a time of the server's that no clock here can be related to.
+        # Latency, timecode, and a time of the server that cannot be related to a clock here.
         if not 12 <= buffer.remaining <= 26:
             raise PacketError(f"{buffer.remaining} bytes end a frame that is not of NatNet {version}")
         return 0, 0, 0
@@ -278,7 +278,7 @@ def _model_definitions(buffer: BoundedBuffer, version: NatNetVersion) -> ModelDe
     bodies: dict[int, str] = {}
     count = buffer.read_uint32()
     if count > MAX_MODELS:
-        raise PacketError(f"the packet says {count} models follow, more than {MAX_MODELS}")
+        raise PacketError(f"the packet announces {count} models, more than {MAX_MODELS}")
     for _ in range(count):
         kind = buffer.read_uint32()
         end = buffer.read_uint32() + buffer.pointer if _sized(version) else None
@@ -287,7 +287,7 @@ def _model_definitions(buffer: BoundedBuffer, version: NatNetVersion) -> ModelDe
             bodies[body.id_num] = body.name
         elif end is None:
             if kind not in _DESCRIPTIONS:
-                raise PacketError(f"a model of the unknown kind {kind}: all behind it is lost")
+                raise PacketError(f"a model of the unknown kind {kind}: the rest cannot be read")
             _DESCRIPTIONS[kind](buffer, version)
         if end is not None:
             buffer.skip(end - buffer.pointer)

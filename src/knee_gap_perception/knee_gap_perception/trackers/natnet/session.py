@@ -1,8 +1,8 @@
-"""One conversation with a NatNet server, without sockets: packets and times in, requests and frames out.
+"""Session with a NatNet server, without sockets: packets and times in, requests and frames out.
 
-It connects, asks for the names of the bodies, keeps the connection alive, maps the server's clock to ours by
-echoes, and starts over, ever more patiently, when the server goes away. Times are of the local monotonic
-clock [ns].
+It connects, asks for the names of the bodies, keeps the connection alive, and maps the server's clock to the
+local one by echoes. If the server is lost, it connects again, at growing intervals. Times are those of the
+local monotonic clock [ns].
 """
 
 from collections import Counter, deque
@@ -23,24 +23,24 @@ Address = tuple[str, int]
 FIRST_RETRY_NS = NANOSECONDS // 4
 LAST_RETRY_NS = 4 * NANOSECONDS
 ECHO_NS = NANOSECONDS // 2
-# The first echoes follow each other closely, so that stamps are there soon; more of them while the clock is
-# known only roughly.
+# The first echoes follow each other closely, so that stamps are available soon, and more of them while the
+# clock's error is large.
 FIRST_ECHOES = 8
 MOST_FIRST_ECHOES = 60
 FINE_CLOCK_NS = 100_000
 FIRST_ECHO_NS = 20_000_000
 KEEP_ALIVE_NS = NANOSECONDS // 2
 MODELS_NS = 2 * NANOSECONDS
-# Without any packet for so long the server is gone; without a frame, there is no data.
+# Time without a packet after which the server is lost, and time without a frame after which data are missing.
 GONE_NS = 2 * NANOSECONDS
 NO_DATA_NS = NANOSECONDS
-# A jump of the frame numbers beyond this is a server that counts anew, not a loss.
+# A larger jump of the frame numbers is a server that counts from the start again, not a loss.
 MOST_LOST = 100_000
-# How old a frame may be when it arrives, and how far in the future the clock's error may put it.
+# Largest age of a frame on arrival, and largest time in the future by the clock's error.
 OLDEST_FRAME_NS = NANOSECONDS
 NEWEST_FRAME_NS = 5_000_000
-# Frames by whose latency others are judged while an echo contradicts the clock, and how many of those must
-# not fit before the server is taken to have restarted.
+# Number of frames whose latencies are the reference while an echo contradicts the clock, and number of frames
+# that must deviate before the server counts as restarted.
 USUAL_LATENCIES = 64
 FEWEST_NOT_FITTING = 2
 FRAME_HEAD = int(MessageId.FRAME).to_bytes(2, "little")
@@ -48,13 +48,13 @@ FRAME_HEAD = int(MessageId.FRAME).to_bytes(2, "little")
 
 @dataclass
 class Due:
-    """When something is to be sent next [ns], and how long after that again."""
+    """Next time at which a request is due [ns], and the interval to the one after."""
 
     at_ns: int = 0
     every_ns: int = 0
 
     def take(self, now_ns: int) -> bool:
-        """Whether it is due; if so, it is put off by its interval."""
+        """Whether the request is due; if so, it is postponed by its interval."""
         if now_ns < self.at_ns:
             return False
         self.at_ns = now_ns + self.every_ns
@@ -62,10 +62,10 @@ class Due:
 
 
 class NatNetSession:
-    """State of the conversation; `counts` holds what was refused, for diagnostics.
+    """State of the session; `counts` are numbers of rejected packets by reason, for diagnostics.
 
-    Only `command_port` of the server answers: what is not a frame and comes from another port is refused.
-    `group` is the multicast group that is listened to, whatever the server states.
+    Only `command_port` of the server answers: packets other than frames are rejected from other ports.
+    `group` is the multicast group that was joined, whatever the server reports.
     """
 
     def __init__(
@@ -101,11 +101,11 @@ class NatNetSession:
         self._stamp_ns = 0
         self._models_wanted = True
         self._models_changed = False
-        # Names before the models changed, when each body was last seen, and why a model was not believed.
+        # Names before the models changed, last time each body was in view, and why a model was rejected.
         self._former_names: dict[int, str] = {}
         self._seen_ns: dict[int, int] = {}
         self._renamed = ""
-        # Latencies of late [ns], and how frames fared since an echo contradicted the clock.
+        # Recent latencies [ns], and counts of frames since an echo contradicted the clock.
         self._latencies_ns: deque[int] = deque(maxlen=USUAL_LATENCIES)
         self._fitting_ns: int | None = None
         self._not_fitting = 0
@@ -145,9 +145,9 @@ class NatNetSession:
     def receive(
         self, data: bytes, sender: Address, arrival_ns: int, ros_offset_ns: int = 0
     ) -> BodyFrame | None:
-        """Take a packet; return the frame that it holds, if it holds one that can be stamped.
+        """Process a packet; return its frame, if it contains one that can be stamped.
 
-        `ros_offset_ns` is the time of ROS minus that of the monotonic clock. Nothing in a packet raises.
+        `ros_offset_ns` is the ROS time minus that of the monotonic clock. No packet raises.
         """
         if sender[0] != self.server:
             self.counts["packets from other machines"] += 1
@@ -158,7 +158,7 @@ class NatNetSession:
             return None
         version = None if self.info is None else self.info.natnet_version
         if version is None and data[:1] != bytes([MessageId.SERVER_INFO]):
-            self.counts["packets before the server told its version"] += 1
+            self.counts["packets before the server's version"] += 1
             return None
         try:
             packet = packets.decode_packet(data, version)
@@ -180,7 +180,7 @@ class NatNetSession:
         return None
 
     def status(self, now_ns: int) -> SourceStatus:
-        """Return how the conversation fares, in plain words."""
+        """Return the status of the session."""
         values: dict[str, object] = dict(sorted(self.counts.items()))
         info = self.info
         if info is None:
@@ -202,13 +202,13 @@ class NatNetSession:
             error_ns = None if self.clock is None or self.clock.ready(now_ns) else self.clock.error_ns
             words = nothing_usable(name, bool(self.names), error_ns, self._renamed)
             return SourceStatus(False, words, values)
-        words = f"frames come from {name}"
+        words = f"frames received from {name}"
         if self.clock is None:
-            words += "; stamps are times of arrival: before NatNet 3.0 the time of exposure is not told"
+            words += "; stamps are times of arrival: there is no time of exposure before NatNet 3.0"
         if self._renamed:
-            words += f"; a model definition that renames {self._renamed}, which is in view, is not believed"
+            words += f"; a model definition that renames {self._renamed}, which is in view, is ignored"
         if self._other_ns and now_ns - self._other_ns < NO_DATA_NS:
-            words += "; a second server sends as well and is not listened to"
+            words += "; a second server sends as well and is ignored"
         return SourceStatus(True, words, values)
 
     def _start_over(self) -> None:
@@ -226,7 +226,7 @@ class NatNetSession:
         if info == self.info:
             return
         if self.info is not None and arrival_ns - self._frame_ns <= NO_DATA_NS:
-            # Nobody asked: the server that was connected to is there.
+            # It was not requested, and the connected server is still sending.
             self.counts["greetings of a server while another sends"] += 1
             return
         self.info = info
@@ -244,7 +244,7 @@ class NatNetSession:
 
     def _on_models(self, models: packets.ModelDefinitions, arrival_ns: int) -> None:
         if not self._models_wanted:
-            self.counts["model definitions not asked for"] += 1
+            self.counts["model definitions without a request"] += 1
             return
         self._renamed = self._renamed_in_view(models.bodies, arrival_ns)
         if self._renamed:
@@ -255,10 +255,10 @@ class NatNetSession:
         self._models_wanted = False
 
     def _renamed_in_view(self, bodies: dict[int, str], arrival_ns: int) -> str:
-        """Which body in view would get another name, in words; empty if none.
+        """Body in view that would get another name, in words; empty if none.
 
-        The scope does not become the tibia before the cameras' eyes. Where the server said that its models
-        changed, a body may get a new name, and none that another body in view had.
+        The scope cannot become the tibia while both are in view. If the server reported that its models
+        changed, a body may get a new name, but not that of another body in view.
         """
         known = self.names or self._former_names
         for number, name in known.items():
@@ -272,7 +272,7 @@ class NatNetSession:
     def _on_echo(self, echo: packets.EchoResponse, arrival_ns: int) -> None:
         clock = self.clock
         if clock is None or echo.request_stamp not in self._echoes_sent:
-            self.counts["echoes not asked for"] += 1
+            self.counts["echoes without a request"] += 1
             return
         self._echoes_sent.remove(echo.request_stamp)
         if not clock.in_doubt:
@@ -280,7 +280,7 @@ class NatNetSession:
         if clock.add(echo.request_stamp, arrival_ns, echo.server_ticks):
             return
         self.counts["echoes that contradict the clock"] += 1
-        # Asked again at once, so that what is true is soon known.
+        # Request another at once, so that the contradiction is resolved soon.
         self._echo_count = 0
         self._echo.at_ns = arrival_ns + FIRST_ECHO_NS
         if clock.another and self._has_another_clock(arrival_ns):
@@ -288,9 +288,9 @@ class NatNetSession:
             self._latencies_ns.clear()
 
     def _has_another_clock(self, arrival_ns: int) -> bool:
-        """Whether the server restarted: its frames, too, no longer fit the clock that was known.
+        """Whether the server restarted: its frames do not fit the previous clock any more either.
 
-        Echoes alone may be forged; frames come another way, and their latency would have jumped as well.
+        Echoes alone may be forged. Frames arrive on another path, and their latency would have jumped too.
         """
         if not self._latencies_ns or arrival_ns - self._frame_ns > NO_DATA_NS:
             return True
@@ -305,7 +305,7 @@ class NatNetSession:
         self._frame_ns = arrival_ns
         self._connect.every_ns = FIRST_RETRY_NS
         if frame.models_changed and not self._models_changed:
-            # An id may mean another body from here on: better no name than a wrong one.
+            # An id may mean another body from now on: no name is better than a wrong one.
             self._former_names = self.names or self._former_names
             self.names = {}
             self._models_wanted = True
@@ -315,7 +315,7 @@ class NatNetSession:
             self._models_wanted = True
         self._note_seen(frame, arrival_ns)
         if self._last_number is not None and 0 < frame.number - self._last_number - 1 < MOST_LOST:
-            self.counts["frames lost on the way"] += frame.number - self._last_number - 1
+            self.counts["frames lost"] += frame.number - self._last_number - 1
         self._last_number = frame.number
         stamp_ns = self._stamp(frame, arrival_ns)
         if stamp_ns is None:
@@ -345,16 +345,16 @@ class NatNetSession:
         return BodyFrame(stamp_ns + ros_offset_ns, bodies, self.names, not exposure_known)
 
     def _note_seen(self, frame: packets.Frame, arrival_ns: int) -> None:
-        """Remember when each body that has a name was last in view."""
+        """Store the last time at which each named body was in view."""
         for body in frame.bodies:
             if body.tracking_valid is not False and (body.id in self.names or body.id in self._former_names):
                 self._seen_ns[body.id] = arrival_ns
 
     def _is_my_server(self, sender: Address, arrival_ns: int) -> bool:
-        """Two servers on one machine differ by their port only; one is kept while its frames can be used.
+        """Choose between two servers on one machine, which differ by their port only.
 
-        The first may be the one that the conversation is not with: its times do not fit the echoes. The ports
-        that the server states are believed before any other.
+        One is kept while its frames can be used. The first can be the wrong one: its times do not fit the
+        echoes. The ports that the server reported take precedence.
         """
         if self._data_from is not None and self._is_stated(sender) != self._is_stated(self._data_from):
             if not self._is_stated(sender):
@@ -369,11 +369,11 @@ class NatNetSession:
         return sender == self._data_from or self._is_second_server(arrival_ns)
 
     def _is_stated(self, sender: Address) -> bool:
-        """Whether frames are expected from a port: that of commands, or of data as the server stated it."""
+        """Whether frames are expected from a port: the command port, or the server's reported data port."""
         return sender[1] in (self._command_port, self.info.data_port if self.info is not None else None)
 
     def _is_second_server(self, arrival_ns: int) -> bool:
-        """Count a frame of a server that is not listened to; False."""
+        """Count a frame of a server that is ignored; return False."""
         self.counts["frames of a second server"] += 1
         self._other_ns = arrival_ns
         return False
@@ -393,7 +393,7 @@ class NatNetSession:
         latency_ns = arrival_ns - stamp_ns
         self._latency_ns = latency_ns
         if not -NEWEST_FRAME_NS <= self._latency_ns <= OLDEST_FRAME_NS:
-            self.counts["frames whose time cannot be"] += 1
+            self.counts["frames with an impossible time"] += 1
             self._echo_count = 0
             self._echo.at_ns = min(self._echo.at_ns, arrival_ns + FIRST_ECHO_NS)
             return None
@@ -401,7 +401,7 @@ class NatNetSession:
         return stamp_ns
 
     def _is_usual(self, latency_ns: int, arrival_ns: int) -> bool:
-        """Whether a frame took as long as those before an echo contradicted the clock; counts both kinds."""
+        """Whether a frame's latency is as before the contradicting echo; both outcomes are counted."""
         known = self._latencies_ns
         usual = bool(known) and min(known) <= latency_ns + OTHER_CLOCK_NS <= max(known) + 2 * OTHER_CLOCK_NS
         if usual:

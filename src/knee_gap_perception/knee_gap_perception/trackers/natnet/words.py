@@ -1,4 +1,4 @@
-"""What a silent NatNet connection most likely means, in words for whoever stands beside it."""
+"""Messages to the user about a NatNet connection without usable data, with the likely causes."""
 
 from math import isfinite
 
@@ -6,23 +6,23 @@ from knee_gap_perception.trackers.natnet.packets import ServerInfo
 
 
 def no_answer(server: str, seconds: float, fault: str) -> str:
-    """Words for a server that does not answer at all."""
+    """Message for a server that does not answer."""
     causes = [
         "Motive does not run or does not stream (Settings > Streaming > Enable)",
         f"{server} is not the address of its local interface there",
         "a firewall on either side stops UDP port 1510",
     ]
     if fault:
-        causes.insert(0, f"what comes is not NatNet ({fault})")
+        causes.insert(0, f"the packets received are not NatNet ({fault})")
     return f"no answer from {server} for {seconds:.0f} s; likely causes: " + "; ".join(causes)
 
 
 def no_data(name: str, seconds: float, info: ServerInfo, fault: str, other: str, group: str) -> str:
-    """Words for a server that answers and sends no frames that can be read; `group` is listened to here."""
+    """Message for a server that answers but sends no readable frames; `group` was joined here."""
     causes = ["Motive is paused in edit mode, or streams no rigid bodies"]
     if info.multicast:
         causes.append(
-            f"this machine gets no multicast {group} (local_address is another interface, or the switch "
+            f"this machine receives no multicast {group} (local_address is another interface, or the switch "
             "filters it): try unicast in Motive and here"
         )
     elif info.multicast is False:
@@ -32,32 +32,32 @@ def no_data(name: str, seconds: float, info: ServerInfo, fault: str, other: str,
     stated = f"{info.multicast_address}:{info.data_port}"
     if info.multicast and stated != group:
         causes.insert(
-            0, f"Motive sends to {stated}, and {group} is listened to: set multicast_address and data_port"
+            0, f"Motive sends to {stated}, but this node joined {group}: set multicast_address and data_port"
         )
     if other:
-        causes.insert(0, f"data come from {other}, which is not the server_address that was set")
+        causes.insert(0, f"data are received from {other}, which is not the server_address that was set")
     if fault:
         causes.insert(0, f"its packets cannot be read ({fault})")
     return f"connected to {name}, but no data for {seconds:.0f} s; likely causes: " + "; ".join(causes)
 
 
 def nothing_usable(name: str, names_known: bool, clock_error_ns: float | None, renamed: str = "") -> str:
-    """Words for frames that come and cannot be used.
+    """Message for frames that are received but cannot be used.
 
-    `clock_error_ns` is None where the clock is good enough; `renamed` a body in view whose name was moved.
+    `clock_error_ns` is None if the clock is good enough; `renamed` is a body in view whose name was moved.
     """
     if clock_error_ns is not None and isfinite(clock_error_ns):
         return (
-            f"frames come from {name}, but the network delays echoes by {clock_error_ns / 5e5:.1f} ms: the "
-            f"time of exposure is known to {clock_error_ns / 1e6:.1f} ms only, worse than max_clock_error"
+            f"frames received from {name}, but echoes take {clock_error_ns / 5e5:.1f} ms: the time of "
+            f"exposure is known to {clock_error_ns / 1e6:.1f} ms only, worse than max_clock_error"
         )
     if clock_error_ns is not None:
-        return f"frames come from {name}, but it answers no echoes: the time of exposure is not known"
+        return f"frames received from {name}, but no echoes: the time of exposure is not known"
     if not names_known and renamed:
         return (
-            f"frames come from {name}, but its model definitions give the name of {renamed}, which is in "
-            "view, to another body: they are not believed; cover the bodies for seconds if that was meant"
+            f"frames received from {name}, but its model definitions give the name of {renamed}, which is in "
+            "view, to another body, so they are ignored; if this is intended, cover the bodies for seconds"
         )
     if not names_known:
-        return f"frames come from {name}, but no model definitions: Motive has no rigid bodies to name"
-    return f"frames come from {name}, but their times cannot be: its clock does not agree with its echoes"
+        return f"frames received from {name}, but no model definitions: Motive has no rigid bodies"
+    return f"frames received from {name}, but with impossible times: its clock contradicts its echoes"
