@@ -167,8 +167,13 @@ class GapEstimator:
         `advice_pieces`: how much work on advice may be done meanwhile.
         """
         self._turn_clock(now_ns)
-        if advice := self._advice_task.turn(self._situation(), advice_pieces):
-            self.advice.append(advice)
+        try:
+            if advice := self._advice_task.turn(self._situation(), advice_pieces):
+                self.advice.append(advice)
+        except (MeasurementError, ArithmeticError, ValueError):
+            # Advice that cannot be calculated costs no estimate.
+            self._advice_task = AdviceTask(self._advice_task.parameters)
+            self.counts["advice that could not be calculated"] += 1
         estimates = self._resolve(now_ns)
         if self._pending or (self._last_edges is None and not self._is_live):
             return estimates
@@ -298,7 +303,9 @@ class GapEstimator:
             return self._without(edges.stamp_ns, edges.track_id, verdict)
         if self._track.profile is not None:
             self.profiles.append(self._track.profile)
-        travel_left = self._advice_task.travel_left(self._track.situation)
+        situation = self._track.situation
+        known = situation is not None and situation.stamp_ns == edges.stamp_ns
+        travel_left = self._advice_task.travel_left(situation) if known else float("nan")
         return self._count(replace(estimate, translation_to_target=travel_left))
 
     def _leg_moved(self, leg: LegBody, pose: LensPose) -> bool:

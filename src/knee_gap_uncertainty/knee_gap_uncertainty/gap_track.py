@@ -275,7 +275,8 @@ class Track:
         section_flaw = section if isinstance(section, str) else ""
         if not isinstance(section, str):
             opening = opening_of(view.bearings, section.bearings)
-            section_flaw = flaw_of(opening, np.linalg.norm(fitted.points - view.lens, axis=1))
+            ranges = np.linalg.norm(fitted.points - view.lens, axis=1)
+            section_flaw = flaw_of(opening, ranges, section.error + observation.angular_error)
             if not section_flaw:
                 measured = self._with_gap(measured, observation, view, fitted, opening, section)
         facts = Facts(

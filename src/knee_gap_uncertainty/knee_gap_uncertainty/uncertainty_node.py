@@ -118,16 +118,20 @@ class UncertaintyNode(BaseNode):
 
     def publish(self, estimates: Sequence[gap_estimate.GapEstimate]) -> None:
         """Publish each estimate; the plain numbers only where they are valid."""
+        valid = set()
         for measured in estimates:
             estimate = self._estimator.leaving(measured, self.now_ns())
             self._gap.publish(messages.fill_gap_estimate(GapEstimate(), estimate))
             if estimate.status is gap_estimate.GapStatus.VALID:
+                valid.add(estimate.stamp_ns)
                 for name, publisher in self._numbers.items():
                     publisher.publish(Float64(data=float(getattr(estimate, name))))
             elif estimate.rejection is not None:
                 self.log_once(estimate.rejection.reason, f"{estimate.status.name}: {estimate.reason}")
         while self._estimator.profiles:
-            self._profile.publish(messages.fill_gap_profile(GapProfile(), self._estimator.profiles.popleft()))
+            profile = self._estimator.profiles.popleft()
+            if profile.stamp_ns in valid:
+                self._profile.publish(messages.fill_gap_profile(GapProfile(), profile))
 
     def recover(self, fault: Fault) -> None:
         """Start the estimator afresh, and say of the image that raised that nothing is known of it."""

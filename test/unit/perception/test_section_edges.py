@@ -105,6 +105,14 @@ def test_an_edge_that_jumps_is_not_believed_before_it_stays():
     assert find(after, finder=finder, stamp_ns=1_100_000_000)[0].seen
 
 
+def test_one_image_after_a_long_time_does_not_move_an_edge():
+    finder = SectionEdgeFinder(CENTRE, ACROSS, points())
+    before, after = (picture(straight(row), straight(420.0)) for row in (300.0, 340.0))
+    assert find(before, finder=finder)[0].seen
+    assert not find(after, finder=finder, stamp_ns=900_000_000)[0].seen
+    assert find(after, finder=finder, stamp_ns=917_000_000)[0].seen
+
+
 def test_without_a_step_in_brightness_there_is_no_edge():
     edges, more = find(picture(straight(300.0), straight(420.0), tissue=26), profile=True)
     assert edges.states == (EdgeState.UNKNOWN, EdgeState.UNKNOWN)

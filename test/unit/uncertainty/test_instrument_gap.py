@@ -6,14 +6,17 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     CONE,
+    CONTOUR_SHAPES,
     KIND_CONTOUR,
     KIND_RIM,
     TILTS,
     Edges,
+    bounds_of_gap,
     edge_points,
     flaw_of,
     instrument_gap,
     opening_of,
+    side,
     widest,
     widest_gap,
     worst_case,
@@ -98,9 +101,9 @@ def some_cylinders(rng, radii=(0.009, 0.028)):
         half = np.radians(rng.uniform(6.0, 18.0))
         ranges = rng.uniform(0.009, 0.020, 2)
         centres = []
-        for side, radius, distance in ((-1.0, lower, ranges[0]), (1.0, upper, ranges[1])):
-            contact = distance * np.array([side * np.sin(half), np.cos(half)])
-            normal = side * np.array([np.cos(half), -side * np.sin(half)])
+        for sign, radius, distance in ((-1.0, lower, ranges[0]), (1.0, upper, ranges[1])):
+            contact = distance * np.array([sign * np.sin(half), np.cos(half)])
+            normal = sign * np.array([np.cos(half), -sign * np.sin(half)])
             centres.append(tuple(contact + radius * normal))
         scene = TwoCylinders(centres, (lower, upper), arc=float(rng.uniform(0.08, 0.2)))
         if scene.gap() > 0.5e-3:
@@ -258,18 +261,51 @@ def test_the_edge_of_a_cylinder_lies_about_where_its_tangent_touches():
 def test_edges_that_cross_and_points_inside_the_opening_are_refused():
     scene = some_cylinders(np.random.default_rng(2))
     points, ranges = bearings(scene.points), np.linalg.norm(scene.points, axis=1)
-    assert flaw_of(opening_of(points, scene.edges), ranges) == ""
-    assert "inside" in flaw_of(opening_of(points, scene.edges[::-1]), ranges)
+    assert flaw_of(opening_of(points, scene.edges), ranges, 0.01) == ""
+    assert "inside" in flaw_of(opening_of(points, scene.edges[::-1]), ranges, 0.01)
     inside = 0.5 * scene.edges + 0.5 * scene.edges[::-1]
     between = bearings(inside + 0.2 * (scene.edges - inside))
-    assert "inside" in flaw_of(opening_of(between, scene.edges), ranges)
+    assert "inside" in flaw_of(opening_of(between, scene.edges), ranges, 0.01)
     one = np.stack([scene.edges[0], scene.edges[0]])
-    assert "opening" in flaw_of(opening_of(points, one), ranges)
+    assert "opening" in flaw_of(opening_of(points, one), ranges, 0.01)
 
 
 def test_points_that_are_not_beside_their_edges_are_refused():
     scene = some_cylinders(np.random.default_rng(2))
     opening, ranges = opening_of(bearings(scene.points), scene.edges), np.linalg.norm(scene.points, axis=1)
-    assert "far from its edge" in flaw_of(opening._replace(insets=np.array([0.03, 0.3])), ranges)
-    assert "different distances" in flaw_of(opening, ranges * [1.0, 4.0])
-    assert flaw_of(opening, np.array([np.nan, 0.01])) == ""
+    assert "far from its edge" in flaw_of(opening._replace(insets=np.array([0.03, 0.3])), ranges, 0.01)
+    assert "different distances" in flaw_of(opening, ranges * [1.0, 4.0], 0.01)
+    assert flaw_of(opening, np.array([np.nan, 0.01]), 0.01) == ""
+
+
+@pytest.mark.parametrize("inset", [0.0005, 0.002, 0.02, 0.035])
+def test_least_and_greatest_gap_are_so_for_any_error_within_the_bounds(inset):
+    """The side is not monotone in the edge's error; both ends are looked for, not assumed."""
+    rng = np.random.default_rng(int(1e4 * inset))
+    opening = opening_of(bearings(some_cylinders(rng).points), some_cylinders(rng).edges)
+    opening = opening._replace(half=0.3, insets=np.full(2, inset), in_plane=np.ones(2))
+    ranges, edge_error, image_error = np.array([0.015, 0.013]), 0.011, 0.001
+    edges = Edges(np.zeros((2, 3)), np.full(2, edge_error / 3.0), edge_error, (KIND_CONTOUR, KIND_CONTOUR))
+    lower, upper = bounds_of_gap(ranges, ranges, opening, edges, image_error)
+    for _ in range(300):
+        wrong = edge_error * rng.uniform(-1.0, 1.0, 2)
+        apart = image_error * rng.uniform(-1.0, 1.0, 2)
+        first, second = (np.array([CONTOUR_SHAPES[rng.integers(len(CONTOUR_SHAPES))]]) for _ in range(2))
+        gap = max(
+            side(ranges[0], 0.3 + wrong[0] + tilt, inset - wrong[0] + apart[0], *first[0])
+            + side(ranges[1], 0.3 + wrong[1] - tilt, inset - wrong[1] + apart[1], *second[0])
+            for tilt in TILTS
+        )
+        assert lower <= gap <= upper
+
+
+def test_the_axis_passes_midway_between_what_it_touches():
+    scene = TwoCylinders([(-0.021, 0.012), (0.021, 0.019)], (0.018, 0.018))
+    opening = opening_of(bearings(scene.points), scene.edges)
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_CONTOUR))
+    found = instrument_gap(fit_of(scene.points, np.zeros((6, 6))), LENS, opening, edges, 1.96)
+    away = [
+        np.linalg.norm(np.cross(found.axis, np.array([0.0, *centre]) - found.point)) - radius
+        for centre, radius in zip(scene.centres, scene.radii, strict=True)
+    ]
+    assert away == pytest.approx([found.gap / 2.0] * 2, abs=0.15e-3)

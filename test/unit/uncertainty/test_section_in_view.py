@@ -103,7 +103,7 @@ def profile(widths):
     points = unit(POINTS)
     opening = opening_of(points, edges.bearings)
     ranges = np.linalg.norm(POINTS - lens, axis=1)
-    near_far = (0.98 * ranges[None], 1.02 * ranges[None])
+    near_far = (0.98 * ranges, 1.02 * ranges)
     return gap_profile(5, "world", 3, sections, np.eye(3), ranges, near_far, opening, edges)
 
 
@@ -131,3 +131,17 @@ def test_sections_without_both_edges_are_left_out():
     assert len(found.gap) == 6
     empty = profile([np.nan, 0.002, np.nan])
     assert empty.widest == 0
+
+
+def test_an_edge_that_left_the_picture_while_the_other_is_hidden_bounds_from_below_only():
+    section = SectionInView(0.7)
+    section.at(*at(1.0), 0.012)
+    found = section.at(*at(1.1, states=(EdgeState.UNKNOWN, EdgeState.AT_BORDER)), 0.012)
+    assert not found.bounded
+
+
+def test_a_carried_edge_is_as_uncertain_as_the_points_that_carry_it():
+    section = SectionInView(0.7)
+    section.at(*at(1.0), 0.012)
+    # Both the point then and the point now are known to 4e-3 rad.
+    assert section.at(*at(1.03, states=HIDDEN), 0.012).error > 3e-3 + 2 * 4e-3

@@ -115,6 +115,8 @@ class SectionEdgeFinder:
         self._offset = float((centre - middle) @ across)
         self._insets: Array | None = None
         self._seen_ns = 0
+        # Where the edges of the last image were that was not believed.
+        self._elsewhere: Array | None = None
         self._circle: Circle | None = None
         self._settled = False
 
@@ -231,7 +233,8 @@ class SectionEdgeFinder:
             [borders[0].place[first] + borders[1].place[second], rows[second] - rows[first]], float
         )
         angle = float(np.arctan2(apart[1], apart[0]))
-        angle = float(np.clip(share * angle, -SLOWEST_TURN / share, SLOWEST_TURN / share))
+        if self._settled:
+            angle = float(np.clip(share * angle, -SLOWEST_TURN, SLOWEST_TURN))
         cosine, sine = np.cos(angle), np.sin(angle)
         along = np.array([-self._across[1], self._across[0]])
         turned = cosine * self._across + sine * along
@@ -289,7 +292,12 @@ class SectionEdgeFinder:
         if self._insets is None:
             return True
         since = 1e-9 * (stamp_ns - self._seen_ns)
-        return since > HELD or bool(np.abs(insets - self._insets).max() < JUMP + JUMP_RATE * since)
+        before, self._elsewhere = self._elsewhere, None
+        if np.abs(insets - self._insets).max() < JUMP + JUMP_RATE * min(since, HELD):
+            return True
+        self._elsewhere = insets
+        stays = before is not None and np.abs(insets - before).max() < JUMP
+        return since > HELD and bool(stays)
 
     def _profile(
         self,
@@ -304,7 +312,8 @@ class SectionEdgeFinder:
         for station in range(-STATIONS, STATIONS + 1):
             at = station * STATION_STEP * circle.radius
             there = largest_circle(rows, (borders[0].place, borders[1].place), at)
-            sections.append(self._edges(there, rows, borders, centre, field, camera, at))
+            edges = self._edges(there, rows, borders, centre, field, camera, at)
+            sections.append(edges if edges.seen else SectionEdges())
         return tuple(sections)
 
 

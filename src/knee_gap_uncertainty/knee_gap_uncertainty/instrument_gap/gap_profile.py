@@ -67,7 +67,7 @@ def gap_profile(
     """The profile over `sections`, whose bearings `rotation` (3, 3) takes to the frame of the points.
 
     `ranges` (2,) [m] are the distances of the tracked points in the plane of the chosen section, `near_far`
-    (m, 2) [m] those that the admitted errors allow, as of `ranges_under_errors`; `opening` and `edges` belong
+    (2,) [m] the least and greatest that the admitted errors allow; `opening` and `edges` belong
     to the chosen section.
     """
     along = np.cross(opening.across, opening.view)
@@ -87,8 +87,9 @@ def gap_profile(
         wrong = STEEPEST * abs(position)
         near, far = (np.maximum(near_far[0] * farther - wrong, 1e-4), near_far[1] * farther + wrong)
         gap = widest(here.half, ranges * farther, opening.insets, *edges.shapes, TILTS)[0]
-        lower = least_gap(near, far, here.half - section.error, opening.insets, *edges.shapes, TILTS)
-        upper = greatest_gap(near, far, here.half + section.error, opening.insets, *edges.shapes, TILTS)
+        errors = (section.error, 0.0)
+        lower = least_gap(near, far, here.half, opening.insets, *errors, *edges.shapes, TILTS)
+        upper = greatest_gap(near, far, here.half, opening.insets, *errors, *edges.shapes, TILTS)
         rows.append((position, gap, max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND))
     position, gap, lower, upper = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     known = np.flatnonzero(np.isfinite(position))

@@ -46,9 +46,9 @@ ROUGHNESS_BOUND = 0.12e-3
 
 # Places on the confidence ellipse of the two inverse distances at which its extremes are looked for.
 AROUND = 64
+# Errors of an edge at which the extremes of a side are looked for, from one bound to the other.
+EDGE_STEPS = 5
 
-# Angle [rad] by which a tracked point may lie inside the opening before edges and points contradict.
-MOST_INSIDE = 0.01
 # Angle [rad] by which a point may lie beyond its edge, and ratio of the points' distances. Beyond them it
 # is not on the tissue that ends at its edge, but on something before or behind it.
 MOST_INSET = 0.2
@@ -126,11 +126,14 @@ def opening_of(points: Array, edges: Array) -> Opening:
     return Opening(half, np.arctan2(aside, forward) - half, np.hypot(forward, aside), view, across)
 
 
-def flaw_of(opening: Opening, ranges: Array) -> str:
-    """Why edges cannot be used with points at distances (2,) [m], in words; empty if they can."""
+def flaw_of(opening: Opening, ranges: Array, inside: float) -> str:
+    """Why edges cannot be used with points at distances (2,) [m], in words; empty if they can.
+
+    `inside` [rad] is the angle by which errors may make a point appear inside the opening.
+    """
     if not LEAST_HALF < opening.half < MOST_HALF:
         return "the edges do not enclose an opening"
-    if not (opening.insets > -MOST_INSIDE).all():
+    if not (opening.insets > -inside).all():
         return "a tracked point lies inside the opening"
     if not (opening.insets < MOST_INSET).all():
         return "a tracked point lies too far from its edge"
@@ -162,15 +165,26 @@ def instrument_gap(
     own = radius**2 * (edge_variance + shape_variance)
     total = variance + edge_variance + shape_variance
     # The points' errors, the edges' and the shape's are independent of each other.
-    middle = lens + float(ranges.mean()) * opening.view
+    point, axis = _axis(lens, ranges, opening, edges, tilt)
     return InstrumentGap(
         gap=gap,
         lower=max(gap - float(np.sqrt((gap - lower) ** 2 + own)), 0.0),
         upper=gap + float(np.sqrt((upper - gap) ** 2 + own)),
-        point=middle,
-        axis=np.cos(tilt) * opening.view + np.sin(tilt) * opening.across,
+        point=point,
+        axis=axis,
         shares=np.array([edge_variance, shape_variance]) / total,
     )
+
+
+def _axis(lens: Array, ranges: Array, opening: Opening, edges: Edges, tilt: float) -> tuple[Array, Array]:
+    """A point (3,) on the axis of the instrument that fits, as deep as the edges, and its direction (3,)."""
+    angles = (opening.half + tilt, opening.half - tilt)
+    numbers = [(float(ranges[n]), float(opening.insets[n]), edges.shapes[n]) for n in range(2)]
+    out = [mean_side(numbers[n][0], angles[n], *numbers[n][1:])[0] for n in range(2)]
+    depth = float(np.mean([one[0] + mean_farther(*one) for one in numbers])) * np.cos(opening.half)
+    axis = np.cos(tilt) * opening.view + np.sin(tilt) * opening.across
+    normal = np.cos(tilt) * opening.across - np.sin(tilt) * opening.view
+    return lens + depth * axis + 0.5 * (out[1] - out[0]) * normal, axis
 
 
 def widest_gap(points: Array, lens: Array, opening: Opening, edges: Edges) -> float:
@@ -260,11 +274,15 @@ def admitted_ranges(
     shifts: Array,
     signs: Array,
 ) -> tuple[Array, Array]:
-    """Least and greatest distance (m, 2) [m] of the points in the plane of the section; as `worst_case`."""
-    near, far = ranges_under_errors(
-        np.ascontiguousarray(travel), present, first, angular_error, shifts, signs
-    )
-    return near * opening.in_plane, far * opening.in_plane
+    """Least and greatest distance (2,) [m] of the points in the plane of the section; as `worst_case`.
+
+    Displacements along the travel, which change the scale most, are admitted beside `shifts`.
+    """
+    along = travel / max(float(np.linalg.norm(travel)), TINY)
+    farthest = float(np.linalg.norm(shifts, axis=1).max())
+    every = np.concatenate([shifts, [farthest * along, -farthest * along]])
+    near, far = ranges_under_errors(np.ascontiguousarray(travel), present, first, angular_error, every, signs)
+    return (near * opening.in_plane, far * opening.in_plane) if near.size else (near, far)
 
 
 def bounds_of_gap(
@@ -273,23 +291,9 @@ def bounds_of_gap(
     """Least and greatest instrument gap [m] for the distances of `admitted_ranges`; as `worst_case`."""
     if not near.size:
         return 0.0, np.inf
-    narrower = edges.error - image_error
-    lower = least_gap(
-        near,
-        far,
-        opening.half - edges.error,
-        np.maximum(opening.insets + narrower, 0.0),
-        *edges.shapes,
-        TILTS,
-    )
-    upper = greatest_gap(
-        near,
-        far,
-        opening.half + edges.error,
-        np.maximum(opening.insets - narrower, 0.0),
-        *edges.shapes,
-        TILTS,
-    )
+    errors = (edges.error, image_error)
+    lower = least_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
+    upper = greatest_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
     return max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND
 
 
@@ -325,17 +329,31 @@ def mean_side(distance: float, angle: float, inset: float, shapes: Array) -> tup
 
 
 @compiled
-def side_range(near: float, far: float, angle: float, inset: float, shapes: Array) -> tuple[float, float]:
-    """Least and greatest `side` [m] over the admitted shapes (n, 2) and distances from `near` to `far`."""
+def side_range(
+    near: float, far: float, angle: float, inset: float, edge_error: float, image_error: float, shapes: Array
+) -> tuple[float, float]:
+    """Least and greatest `side` [m] that the admitted errors allow.
+
+    Distances lie from `near` to `far` [m]. The edge is wrong by up to `edge_error` [rad], which moves it
+    against axis and point alike, and the point against it by up to `image_error` [rad] more. The side is not
+    monotone in the edge's error, since an edge nearer to its point lies nearer to the lens.
+    """
     least, greatest = np.inf, -np.inf
-    for k in range(shapes.shape[0]):
-        for distance in (near, far):
-            # An axis tilted beyond the edge leaves a farther edge less room.
-            if not distance < np.inf:
-                value = np.inf if angle > 0.0 else -np.inf
-            else:
-                value = side(distance, angle, inset, shapes[k, 0], shapes[k, 1])
-            least, greatest = min(least, value), max(greatest, value)
+    for step in range(EDGE_STEPS + 1):
+        if step < EDGE_STEPS:
+            error = edge_error * (2.0 * step / (EDGE_STEPS - 1) - 1.0)
+        else:
+            # Where the point may lie on the line of sight along the edge.
+            error = min(max(inset - image_error, -edge_error), edge_error)
+        for sign in (-1.0, 1.0):
+            moved = inset - error + sign * image_error
+            for k in range(shapes.shape[0]):
+                for distance in (near, far):
+                    if distance < np.inf:
+                        value = side(distance, angle + error, moved, shapes[k, 0], shapes[k, 1])
+                    else:
+                        value = np.inf if angle + error > 0.0 else -np.inf
+                    least, greatest = min(least, value), max(greatest, value)
     return least, greatest
 
 
@@ -366,58 +384,62 @@ def widest(
 def ranges_under_errors(
     travel: Array, present: Array, first: Array, angular_error: float, shifts: Array, signs: Array
 ) -> tuple[Array, Array]:
-    """Least and greatest distance (m, 2) [m] of both points from the present lens.
+    """Least and greatest distance (2,) [m] of both points from the present lens.
 
-    A row for each pair of displacements. Empty where an admitted error turns a bearing into the direction of
-    travel.
+    Empty where an admitted error turns a bearing into the direction of travel.
     """
     t = vector(travel)
-    lengths_0, angle_0 = ring_lengths(t, row(present, 0), row(first, 0), angular_error, shifts, signs)
-    lengths_1, angle_1 = ring_lengths(t, row(present, 1), row(first, 1), angular_error, shifts, signs)
-    if not min(angle_0, angle_1) > SMALLEST_ANGLE:
-        return np.empty((0, 2)), np.empty((0, 2))
-    rows = signs.shape[0]
-    pairs = lengths_0.size // rows
-    near, far = np.full((pairs, 2), np.inf), np.zeros((pairs, 2))
-    for pair in range(pairs):
-        for k in range(rows):
-            lengths = (lengths_0[pair * rows + k], lengths_1[pair * rows + k])
-            for n in range(2):
-                near[pair, n] = min(near[pair, n], lengths[n])
-                far[pair, n] = max(far[pair, n], lengths[n])
+    near, far = np.full(2, np.inf), np.zeros(2)
+    for n in range(2):
+        lengths, angle = ring_lengths(t, row(present, n), row(first, n), angular_error, shifts, signs)
+        if not angle > SMALLEST_ANGLE:
+            return np.empty(0), np.empty(0)
+        near[n], far[n] = np.min(lengths), np.max(lengths)
     return near, far
 
 
 @compiled
 def least_gap(
-    near: Array, far: Array, half: float, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
+    near: Array,
+    far: Array,
+    half: float,
+    insets: Array,
+    edge_error: float,
+    image_error: float,
+    shapes_0: Array,
+    shapes_1: Array,
+    tilts: Array,
 ) -> float:
-    """Gap [m] that is free whatever the pair of displacements (m, 2), at the tilt where most is.
+    """Gap [m] that is free whatever the admitted errors, at the tilt where most is.
 
     Only within the lines of sight along the edges is tissue known to be absent.
     """
     best = 0.0
     for k in range(tilts.size):
-        if abs(tilts[k]) > max(half, 0.0):
+        if abs(tilts[k]) > max(half - edge_error, 0.0):
             continue
-        lower = np.inf
-        for pair in range(near.shape[0]):
-            first = side_range(near[pair, 0], far[pair, 0], half + tilts[k], insets[0], shapes_0)[0]
-            second = side_range(near[pair, 1], far[pair, 1], half - tilts[k], insets[1], shapes_1)[0]
-            lower = min(lower, first + second)
-        best = max(best, lower)
+        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
+        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
+        best = max(best, first[0] + second[0])
     return best
 
 
 @compiled
 def greatest_gap(
-    near: Array, far: Array, half: float, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
+    near: Array,
+    far: Array,
+    half: float,
+    insets: Array,
+    edge_error: float,
+    image_error: float,
+    shapes_0: Array,
+    shapes_1: Array,
+    tilts: Array,
 ) -> float:
-    """Gap [m] that no pair of displacements (m, 2) exceeds, at any tilt."""
+    """Gap [m] that no admitted error exceeds, at any tilt."""
     best = 0.0
     for k in range(tilts.size):
-        for pair in range(near.shape[0]):
-            first = side_range(near[pair, 0], far[pair, 0], half + tilts[k], insets[0], shapes_0)[1]
-            second = side_range(near[pair, 1], far[pair, 1], half - tilts[k], insets[1], shapes_1)[1]
-            best = max(best, first + second)
+        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
+        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
+        best = max(best, first[1] + second[1])
     return best

@@ -28,7 +28,7 @@ class SectionInView:
         self._across = np.zeros(3)
         self._lens = np.zeros(3)
         self._stamp_ns = 0
-        self._error = float("nan")
+        self._error = self._image_error = float("nan")
         self._deviations = np.zeros(2)
 
     def at(self, observation: EdgeObservation, view: PosedView, distance: float) -> Edges | str:
@@ -50,6 +50,7 @@ class SectionInView:
             self._insets, self._across = opening.insets, opening.across
             self._lens, self._stamp_ns = view.lens, observation.stamp_ns
             self._error, self._deviations = section.error, section.deviations
+            self._image_error = observation.angular_error
         return edges
 
     def _carried(self, observation: EdgeObservation, view: PosedView, distance: float) -> Edges | str:
@@ -67,8 +68,15 @@ class SectionInView:
         bearings = np.cos(angles)[:, None] * middle + np.sin(angles)[:, None] * across
         moved = float(np.linalg.norm(view.lens - self._lens)) / max(distance, 1e-6)
         growth = SLIDE * moved + UNSEEN_RATE * unseen
+        # The inset held the point's error then, and the present point has its own.
+        image_error = self._image_error + observation.angular_error
+        bounded = EdgeState.AT_BORDER not in observation.section.states
         return Edges(
-            bearings, np.hypot(self._deviations, growth / 2.0), self._error + growth, observation.kinds, True
+            bearings,
+            np.sqrt(self._deviations**2 + (growth / 2.0) ** 2 + (image_error / 3.0) ** 2),
+            self._error + growth + image_error,
+            observation.kinds,
+            bounded,
         )
 
 
