@@ -1,8 +1,8 @@
 """Where the input of a test comes from: made by the tests, or recorded by others and beside the checkout.
 
 The recordings belong to others and are not part of this repository: they are looked for in `../shared/data`.
-A test of real input runs on input of the same kind that a module of this folder makes, and on the recording as
-well if it is there.
+A test of real input runs on input of the same kind that a module of this folder makes, and on the recording
+too if it is there.
 """
 
 from pathlib import Path
