@@ -21,16 +21,16 @@ from live import RELIABLE, Client
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
+from sample_bag import SAMPLE, sample_camera_info
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Float64, Header
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_msgs.msg import GapEdges, GapEstimate, ScopeCalibration, ScopeRotation
-from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
+from knee_gap_simulation.recordings.recording import IMAGE
 
 DOMAIN = 132
-SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
 # As the suite is shipped, so that the seam itself is tested; the diagnostics say that it had nothing to do.
 ENVIRONMENT = {
     "ROS_DOMAIN_ID": str(DOMAIN),
@@ -119,7 +119,7 @@ class Suite:
         with BagReader(SAMPLE) as bag:
             entries = zip(bag.messages([IMAGE]), range(6), strict=False)
             self.pictures = [bytes(bag.deserialize(entry).data) for entry, _ in entries]
-            info = bag.deserialize(next(iter(bag.messages([CAMERA_INFO]))))
+        info = sample_camera_info()
         self.info = CameraInfo(width=info.width, height=info.height, distortion_model=info.distortion_model)
         self.info.d, self.info.k = list(info.d), np.array(info.k)
         self.stamp_ns = 2 * 10**18

@@ -14,12 +14,12 @@ import pytest
 pytest.importorskip("rclpy")
 
 from live import Client
+from sample_bag import SAMPLE
 
 from knee_gap_bringup.launching.processes import executable
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 
 ROOT = Path(__file__).parents[2]
-SAMPLE = ROOT / "bags" / "sample"
 DOMAIN = 112
 ENVIRONMENT = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 LIVE = executable("knee_gap_bringup", "live")

@@ -1,6 +1,5 @@
 """tracking_node on a Motive that errs: what is no measurement is not published, and diagnostics say why."""
 
-import socket
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from live import Client
+from ports import free_port
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_simulation.natnet.scene import TrackedScene
@@ -23,12 +23,6 @@ RATE = 120
 CLOSE = 0.4e-3
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def distance_from_truth(message: PoseWithCovarianceStamped) -> float:

@@ -15,16 +15,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from live import Client
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sample_bag import sample_camera_info, sample_images
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from knee_gap_bringup.launching.processes import Processes, executable
-from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges
-from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
 DOMAIN = 52
-SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
@@ -32,16 +30,13 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
-    """The first images of the sample bag, and its camera."""
-    with BagReader(SAMPLE) as bag:
-        images = [bag.deserialize(entry) for entry, _ in zip(bag.messages([IMAGE]), range(10), strict=False)]
-    return [cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR) for image in images]
+    """The first images of the sample bag."""
+    return sample_images(10)
 
 
 @pytest.fixture(scope="module")
 def camera() -> CameraInfo:
-    with BagReader(SAMPLE) as bag:
-        info = bag.deserialize(next(iter(bag.messages([CAMERA_INFO]))))
+    info = sample_camera_info()
     message = CameraInfo(height=int(info.height), width=int(info.width))
     message.distortion_model = info.distortion_model
     message.d, message.k = [float(v) for v in info.d], np.asarray(info.k, dtype=float)

@@ -1,4 +1,4 @@
-"""Real frames and a real trajectory, which do not belong together, through the live nodes: no crash."""
+"""Frames and a trajectory of others, which do not belong together, through the live nodes: no crash."""
 
 import time
 from itertools import islice
@@ -11,6 +11,10 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from endoscope_images import RIGID_ENDOSCOPE, EndoscopeFrames, rigid_endoscope
+from motive_takes import THREE_BODIES, three_body_take
+from recordings import origins
+
 from knee_gap_bringup.comparison import EDGES, GAP
 from knee_gap_bringup.demo import play_through_nodes
 from knee_gap_core.bag.bag import BagReader, BagWriter
@@ -21,9 +25,6 @@ from knee_gap_perception.trackers.motive_csv import read_take
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
 ROOT = Path(__file__).parents[2]
-DATA = ROOT.parent / "shared" / "data"
-FRAMES = DATA / "images" / "sinus_endoscope"
-TAKE = DATA / "optitrack" / "motive_csv" / "pathviewr_v123_quat_m_3rb.csv"
 OUT = ROOT / "out" / "real"
 START_NS = 1_700_000_000_000_000_000
 IMAGE_PERIOD_NS = 40_000_000
@@ -33,7 +34,6 @@ MAX_POSE_AGE_NS = 25_000_000
 pytestmark = [
     pytest.mark.system,
     pytest.mark.timeout(240),
-    pytest.mark.skipif(not FRAMES.is_dir() or not TAKE.is_file(), reason=f"no real recordings at {DATA}"),
 ]
 
 
@@ -43,11 +43,11 @@ def stamped(message: Any, stamp_ns: int, frame_id: str) -> Any:
     return message
 
 
-def write_bag(path: Path) -> int:
+def write_bag(path: Path, frames: EndoscopeFrames, take_path: Path) -> int:
     """Frames to and fro at 25 Hz for 4 s, poses at the take's own times; returns the number of images."""
-    pictures = [file.read_bytes() for file in sorted(FRAMES.glob("*.jpg")) if "mask" not in file.name]
+    pictures = [file.read_bytes() for file in frames.files]
     order = (list(range(len(pictures))) + list(range(len(pictures) - 2, 0, -1))) * 4
-    fx, fy, cx, cy = (float(v) for v in (FRAMES / "camera_intrinsics_per_view").read_text().split())
+    fx, fy, cx, cy = frames.pinhole
     size = cv2.imdecode(np.frombuffer(pictures[0], np.uint8), cv2.IMREAD_COLOR).shape
     records: list[tuple[int, str, Any]] = []
     for k, index in enumerate(order[:100]):
@@ -58,7 +58,7 @@ def write_bag(path: Path) -> int:
         image = stamped(blank("sensor_msgs/msg/CompressedImage"), stamp, "arthroscope_optical")
         image.format, image.data = "jpeg", np.frombuffer(pictures[index], np.uint8)
         records += [(stamp + 1, CAMERA_INFO, info), (stamp + 2, IMAGE, image)]
-    take = read_take(TAKE)
+    take = read_take(take_path)
     name = take.bodies[0].name
     # The take begins in the middle of a longer capture.
     for frame in islice(take.frames(START_NS - round(float(take.time[0]) * 1e9)), 405):
@@ -120,9 +120,11 @@ STATUS_NAMES = {
 }
 
 
-def test_real_frames_and_poses(tmp_path: Path) -> None:
-    bag = tmp_path / "real"
-    images = write_bag(bag)
+@pytest.mark.parametrize("origin", origins(RIGID_ENDOSCOPE, THREE_BODIES))
+def test_real_frames_and_poses(origin: str, tmp_path: Path) -> None:
+    bag, frames = tmp_path / "real", tmp_path / "frames"
+    frames.mkdir()
+    images = write_bag(bag, rigid_endoscope(origin, frames, count=16), three_body_take(origin, tmp_path).path)
     out = tmp_path / "out"
     out.mkdir()
     # Fails if a node has died on the way.
@@ -135,7 +137,7 @@ def test_real_frames_and_poses(tmp_path: Path) -> None:
         assert "Traceback" not in log.read_text()
 
     edges = {stamp_of(message): message for message in received[EDGES]}
-    draw_contact_sheet(bag, edges, OUT / "contact_sheet.png")
+    draw_contact_sheet(bag, edges, OUT / origin / "contact_sheet.png")
     assert len(edges) >= 0.9 * images
     assert len(received[GAP]) >= 0.9 * images
     poses = np.array(sorted(stamp_of(message) for message in received[SCOPE_POSE]))

@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
+from sample_bag import SAMPLE
 
 from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_bringup.launching.processes import executable
@@ -18,7 +19,6 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.stamps import stamp_ns
 
 ROOT = Path(__file__).parents[2]
-SAMPLE = ROOT / "bags" / "sample"
 EDGES, GAP = "/knee_gap/gap_edges", "/knee_gap/gap"
 VALID = 1
 LAST_LINE = (

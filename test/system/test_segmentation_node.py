@@ -1,7 +1,6 @@
 """segmentation_node as a process: lens poses, chosen points, and the bad pictures that a theatre sends."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,18 +12,16 @@ pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from live import Client
+from sample_bag import sample_camera_info, sample_images
 from sensor_msgs.msg import CameraInfo, Image
 from std_srvs.srv import Trigger
 
 from knee_gap_bringup.launching.processes import Processes, executable
-from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_msgs.srv import ChoosePoint
-from knee_gap_simulation.recordings.recording import CAMERA_INFO, IMAGE
 
 DOMAIN = 57
-SAMPLE = Path(__file__).parents[2] / "bags" / "sample"
 ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 FRAME_NS = 16_666_667
 VALID, UNKNOWN = GapEdges.STATUS_VALID, GapEdges.STATUS_UNKNOWN
@@ -36,9 +33,7 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
     """The first images of the sample bag."""
-    with BagReader(SAMPLE) as bag:
-        images = [bag.deserialize(entry) for entry, _ in zip(bag.messages([IMAGE]), range(12), strict=False)]
-    return [cv2.imdecode(np.asarray(image.data), cv2.IMREAD_COLOR) for image in images]
+    return sample_images(12)
 
 
 class Feed:
@@ -47,8 +42,7 @@ class Feed:
     def __init__(self, client: Client, processes: Processes) -> None:
         self.client, self.processes = client, processes
         self.stamp_ns = 10**18
-        with BagReader(SAMPLE) as bag:
-            self.info = bag.deserialize(next(iter(bag.messages([CAMERA_INFO]))))
+        self.info = sample_camera_info()
 
     def camera(self, width: int = 1280, height: int = 720, model: str = "equidistant") -> None:
         """Publish the sample's camera, scaled to another size."""

@@ -8,6 +8,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from sample_bag import SAMPLE
+
 from knee_gap_bringup.launching.processes import executable
 
 pytestmark = pytest.mark.system
@@ -61,8 +63,7 @@ def test_a_mistake_ends_a_node_in_one_line(
 def test_a_mistake_ends_play_and_record_in_one_line(
     tmp_path: Path, command: list[str], parameter: str
 ) -> None:
-    bag = Path(__file__).parents[2] / "bags" / "sample"
-    places = {"BAG": str(bag), "OUT": str(tmp_path / "out")}
+    places = {"BAG": str(SAMPLE), "OUT": str(tmp_path / "out")}
     name, *given = (places.get(word, word) for word in command)
     done = subprocess.run(
         [executable("knee_gap_replay", name), *given, "--ros-args", "-p", parameter],

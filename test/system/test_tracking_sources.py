@@ -1,6 +1,5 @@
 """tracking_node on Motive's own protocol: poses with the time of exposure, and a restart survived."""
 
-import socket
 import time
 from pathlib import Path
 
@@ -12,6 +11,7 @@ pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from live import Client
+from ports import free_port
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.values.stamps import set_stamp
@@ -21,12 +21,6 @@ ENVIRONMENT = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "L
 NODE = ("--ros-args", "-r", "__ns:=/knee_gap", "-p", "body_to_shaft_translation:=[0.0, 0.0, 0.0]")
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def stamp(message: PoseWithCovarianceStamped) -> float:

@@ -2,6 +2,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from plain_messages import header, pose
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.errors import PerceptionError
@@ -14,21 +15,10 @@ from knee_gap_perception.trackers.scope_feed import SOURCES, ScopeFeed, SourcePa
 MILLISECOND = 1_000_000
 
 
-def header(stamp_ns):
-    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id="map")
-
-
-def pose(position, turn=(0.0, 0.0, 0.0)):
-    x, y, z, w = Rotation.from_rotvec(turn).as_quat()
-    return SimpleNamespace(
-        position=SimpleNamespace(x=position[0], y=position[1], z=position[2]),
-        orientation=SimpleNamespace(x=x, y=y, z=z, w=w),
-    )
-
-
 def stamped(stamp_ns, position=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
-    return SimpleNamespace(header=header(stamp_ns), pose=pose(position, turn))
+    return SimpleNamespace(
+        header=header(stamp_ns, "map"), pose=pose(position, Rotation.from_rotvec(turn).as_quat())
+    )
 
 
 class TestPoseTopics:

@@ -1,10 +1,12 @@
-"""Calibration of a real tracked laparoscope, and the distances of known dots that it then measures."""
+"""Calibration of a tracked laparoscope, made and recorded, and distances of known dots measured with it."""
 
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import origins
+from tracked_laparoscope import SIZE, TRACKED_LAPAROSCOPE, tracked_laparoscope
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import MeasurementError
@@ -17,13 +19,7 @@ from knee_gap_perception.calibrate.solvers.pivot import calibrate_pivot
 from knee_gap_perception.camera.projection import LensModel
 from knee_gap_uncertainty.two_view.gap_range import gap_range
 
-DATA = Path(__file__).parents[4] / "shared" / "data" / "images" / "tracked_laparoscope"
-SESSION = DATA / "session_15-04-12"
-SIZE = (1920, 540)
-
-pytestmark = pytest.mark.skipif(
-    not SESSION.is_dir(), reason=f"the recordings of a tracked laparoscope are not at {DATA}"
-)
+ORIGINS = origins(TRACKED_LAPAROSCOPE)
 
 
 def transform_mm(path: Path) -> Array:
@@ -32,27 +28,29 @@ def transform_mm(path: Path) -> Array:
     return np.asarray(T)
 
 
-def session() -> list[TrackedView]:
-    model = {int(row[0]): row[1:4] * 1e-3 for row in np.loadtxt(DATA / "April216mm_centres.txt")}
+def session(folder: Path) -> list[TrackedView]:
+    model = {int(row[0]): row[1:4] * 1e-3 for row in np.loadtxt(folder / "April216mm_centres.txt")}
     tracked = []
     for index in range(4):
-        rows = np.loadtxt(SESSION / f"calib.left.points.{index}.txt")
+        rows = np.loadtxt(folder / "session_15-04-12" / f"calib.left.points.{index}.txt")
         ids = rows[:, 0].astype(int)
         view = BoardView(index, ids, np.array([model[i] for i in ids]), rows[:, 1:])
-        tracked.append(TrackedView(view, transform_mm(SESSION / f"calib.tracking.{index}.4x4"), np.zeros(6)))
+        T_world_body = transform_mm(folder / "session_15-04-12" / f"calib.tracking.{index}.4x4")
+        tracked.append(TrackedView(view, T_world_body, np.zeros(6)))
     return tracked
 
 
-def calibrated(model: LensModel) -> HandEye:
-    tracked = session()
+def calibrated(tracked: list[TrackedView], model: LensModel) -> HandEye:
     fit = fit_intrinsics([view.board for view in tracked], *SIZE, model)
     return calibrate_hand_eye(tracked, fit.intrinsics, model)
 
 
+@pytest.mark.parametrize("origin", ORIGINS)
 @pytest.mark.parametrize("name", ["plumb_bob", "equidistant"])
-def test_dot_distances_by_motion_stereo(name: str) -> None:
+def test_dot_distances_by_motion_stereo(origin: str, name: str, tmp_path: Path) -> None:
     """Every distance of two dots lies in its worst-case range, and the median ratio is right to 5 %."""
-    found, tracked = calibrated(LensModel(name)), session()
+    tracked = session(tracked_laparoscope(origin, tmp_path).folder)
+    found = calibrated(tracked, LensModel(name))
     camera = found.intrinsics.camera()
     ratios, inside, total = [], 0, 0
     rng = np.random.default_rng(1)
@@ -82,11 +80,16 @@ def test_dot_distances_by_motion_stereo(name: str) -> None:
     assert inside == len(ratios) > 0.5 * total
 
 
-def test_pivoting_a_real_scope() -> None:
-    """Halves of the recording agree within what each says of itself."""
-    poses = np.array([transform_mm(path) for path in sorted((DATA / "pivot").glob("*.txt"))])
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_pivoting_a_real_scope(origin: str, tmp_path: Path) -> None:
+    """Halves of the recording agree within what each says of itself, and with the truth where it is known."""
+    recording = tracked_laparoscope(origin, tmp_path)
+    poses = np.array([transform_mm(path) for path in sorted((recording.folder / "pivot").glob("*.txt"))])
     whole, halves = calibrate_pivot(poses), (calibrate_pivot(poses[:200]), calibrate_pivot(poses[200:]))
     assert whole.rms < 4e-3
     difference = halves[0].tip - halves[1].tip
     spread = halves[0].covariance + halves[1].covariance
     assert difference @ np.linalg.solve(spread, difference) < 16.3  # 99.9 % of 3 degrees of freedom
+    if recording.tip is not None:
+        error = whole.tip - recording.tip
+        assert error @ np.linalg.solve(whole.covariance, error) < 16.3

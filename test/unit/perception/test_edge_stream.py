@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_messages import bgr_image, header, pose
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
@@ -18,31 +19,11 @@ POSE_NS = 8_333_333
 MS = 1_000_000
 
 
-def header(stamp: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(stamp, 10**9)
-    return SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
-
-
-def image_message(picture: np.ndarray, stamp: int) -> Any:
-    height, width = picture.shape[:2]
-    return SimpleNamespace(
-        header=header(stamp, "arthroscope_optical"),
-        height=height,
-        width=width,
-        step=3 * width,
-        encoding="bgr8",
-        data=picture.tobytes(),
-    )
-
-
 def pose_message(T: np.ndarray, stamp: int, frame_id: str = "world") -> Any:
-    q = Rotation.from_matrix(T[:3, :3]).as_quat()
-    place = SimpleNamespace(**dict(zip("xyz", T[:3, 3], strict=True)))
-    turn = SimpleNamespace(**dict(zip("xyzw", q, strict=True)))
-    pose = SimpleNamespace(position=place, orientation=turn)
+    place = pose(T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat())
     covariance = np.diag([4e-10] * 3 + [1e-10] * 3).ravel()
     return SimpleNamespace(
-        header=header(stamp, frame_id), pose=SimpleNamespace(pose=pose, covariance=covariance)
+        header=header(stamp, frame_id), pose=SimpleNamespace(pose=place, covariance=covariance)
     )
 
 
@@ -78,14 +59,14 @@ def still_poses(made: EdgeStream, until: int, frame_id: str = "world") -> None:
 def test_an_image_waits_for_the_pose_after_it_and_no_longer(joint: Any, travel: Any) -> None:
     made = stream(joint)
     still_poses(made, 4 * POSE_NS)
-    made.on_image(image_message(travel[1][0], 4 * POSE_NS + 1 * MS), now_ns=0)
+    made.on_image(bgr_image(travel[1][0], 4 * POSE_NS + 1 * MS), now_ns=0)
     assert list(made.ready(5 * MS)) == []
     made.on_lens_pose(pose_message(np.eye(4), 5 * POSE_NS))
     (edges,) = made.ready(6 * MS)
     assert (edges.status, edges.pose_used) == (EdgeStatus.VALID, True)
     assert not made.waiting
 
-    made.on_image(image_message(travel[1][1], 6 * POSE_NS), now_ns=10 * MS)
+    made.on_image(bgr_image(travel[1][1], 6 * POSE_NS), now_ns=10 * MS)
     assert list(made.ready(39 * MS)) == []
     (edges,) = made.ready(40 * MS)  # by then the pose is foretold
     assert (edges.status, edges.pose_used) == (EdgeStatus.VALID, True)
@@ -102,7 +83,7 @@ def test_what_is_interpolated_does_not_depend_on_when_the_image_came(joint: Any,
             made.on_lens_pose(before)
             if poses_first:
                 made.on_lens_pose(after)
-            made.on_image(image_message(picture, stamp), stamp)
+            made.on_image(bgr_image(picture, stamp), stamp)
             found += made.ready(stamp)
             if not poses_first:
                 made.on_lens_pose(after)
@@ -119,7 +100,7 @@ def test_an_image_does_not_wait_in_vain(joint: Any, travel: Any, case: str) -> N
     stamp = 10 * POSE_NS
     if case != "no poses":
         still_poses(made, 9 * POSE_NS if case != "the tracker fell silent" else 2 * POSE_NS)
-    made.on_image(image_message(travel[1][0], stamp), now_ns=100)
+    made.on_image(bgr_image(travel[1][0], stamp), now_ns=100)
     assert len(list(made.ready(50 if case == "clock back" else 100))) == 1
 
 
@@ -129,7 +110,7 @@ def test_waiting_images_are_few_and_keep_their_order(joint: Any, travel: Any) ->
     stamps = [9 * POSE_NS + MS * (k + 1) for k in range(MOST_WAITING + 4)]
     found: list[GapEdges] = []
     for stamp in stamps:
-        made.on_image(image_message(travel[1][0], stamp), now_ns=0)
+        made.on_image(bgr_image(travel[1][0], stamp), now_ns=0)
         found += made.ready(0)
         assert made.waiting <= MOST_WAITING
     found += made.finish()
@@ -144,7 +125,7 @@ def test_a_track_begun_without_poses_is_begun_anew_with_them_once(joint: Any, tr
         if k >= 2:
             made.on_lens_pose(pose_message(np.eye(4), stamp - POSE_NS))
             made.on_lens_pose(pose_message(np.eye(4), stamp))
-        made.on_image(image_message(joint.picture(np.eye(4), k), stamp), stamp)
+        made.on_image(bgr_image(joint.picture(np.eye(4), k), stamp), stamp)
         (edges,) = made.ready(stamp)
         ids.append(edges.track_id)
         used.append(edges.pose_used)
@@ -159,7 +140,7 @@ def test_poses_in_another_frame_begin_another_track(joint: Any, travel: Any) -> 
         stamp = (k + 1) * 4 * POSE_NS
         made.on_lens_pose(pose_message(np.eye(4), stamp - POSE_NS, frame))
         made.on_lens_pose(pose_message(np.eye(4), stamp, frame))
-        made.on_image(image_message(joint.picture(np.eye(4), k), stamp), stamp)
+        made.on_image(bgr_image(joint.picture(np.eye(4), k), stamp), stamp)
         ids += [edges.track_id for edges in made.ready(stamp)]
     assert ids == [1, 1, 2, 2]
 
@@ -172,7 +153,7 @@ def test_a_point_behind_a_probe_is_called_hidden(joint: Any, travel: Any) -> Non
         if 3 <= k < 6:
             column, row = np.rint(found[0].pixels[1]).astype(int)
             picture[row - 70 : row + 70, column - 70 : column + 70] = (90, 100, 120)
-        made.on_image(image_message(picture, k * FRAME_NS), 0)
+        made.on_image(bgr_image(picture, k * FRAME_NS), 0)
         found += made.ready(0)
     assert [edges.hidden for edges in found if edges.status is EdgeStatus.VALID][:3] == [(False, False)] * 3
     covered = found[3]
@@ -188,7 +169,7 @@ def test_a_bad_pose_is_counted_and_left_out(joint: Any, travel: Any) -> None:
     bad[0, 3] = np.nan
     for k in range(3):
         made.on_lens_pose(pose_message(bad, k * POSE_NS))
-    made.on_image(image_message(travel[1][0], 3 * POSE_NS), 0)
+    made.on_image(bgr_image(travel[1][0], 3 * POSE_NS), 0)
     (edges,) = made.ready(0)
     assert (edges.status, edges.pose_used) == (EdgeStatus.VALID, False)
     assert made.counts["lens poses refused"] == 3
@@ -199,7 +180,7 @@ def test_a_point_is_chosen_where_there_is_a_gap_and_refused_elsewhere(joint: Any
     assert "camera_info" in made.choose(640.0, 360.0)
     made.on_camera_info(info_message(joint))
     assert "no image" in made.choose(640.0, 360.0)
-    made.on_image(image_message(travel[1][0], 0))
+    made.on_image(bgr_image(travel[1][0], 0))
     (first,) = made.ready()
     for column, row, reason in (
         (5000.0, 360.0, "1280x720"),
@@ -208,11 +189,11 @@ def test_a_point_is_chosen_where_there_is_a_gap_and_refused_elsewhere(joint: Any
         (640.0, 90.0, "no dark gap"),
     ):
         assert reason in made.choose(column, row)
-    made.on_image(image_message(joint.picture(np.eye(4), 50), FRAME_NS))
+    made.on_image(bgr_image(joint.picture(np.eye(4), 50), FRAME_NS))
     (same,) = made.ready()
     assert same.track_id == first.track_id
     assert made.choose(820.0, 360.0) == ""
-    made.on_image(image_message(joint.picture(np.eye(4), 51), 2 * FRAME_NS))
+    made.on_image(bgr_image(joint.picture(np.eye(4), 51), 2 * FRAME_NS))
     (chosen,) = made.ready()
     assert chosen.track_id == first.track_id + 1
     np.testing.assert_allclose(chosen.pixels[:, 0], 820.0, atol=110.0)
@@ -222,20 +203,20 @@ def test_what_cannot_be_read_gives_no_picture_of_an_earlier_image(joint: Any, tr
     made = stream(joint)
     assert made.mask() is None
     assert made.overlay() is None
-    made.on_image(image_message(travel[1][0], 0))
+    made.on_image(bgr_image(travel[1][0], 0))
     assert len(list(made.ready())) == 1
     mask = made.mask()
     assert mask is not None
     assert 0.02 < (mask == 255).mean() < 0.5
     assert made.overlay() is not None
-    cut = image_message(travel[1][1], FRAME_NS)
+    cut = bgr_image(travel[1][1], FRAME_NS)
     cut.data = cut.data[:1000]
     made.on_image(cut)
     (edges,) = made.ready()
     assert edges.status is EdgeStatus.UNKNOWN
     assert made.mask() is None
     assert made.overlay() is None
-    made.on_image(image_message(travel[1][2], 2 * FRAME_NS))
+    made.on_image(bgr_image(travel[1][2], 2 * FRAME_NS))
     assert next(iter(made.ready())).status is EdgeStatus.VALID
     assert (made.reason, "bytes" in made.last_refusal) == ("", True)
 

@@ -1,11 +1,12 @@
 """The disc of the scope, drawn and real."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from endoscope_images import LAPAROSCOPE, RIGID_ENDOSCOPE, laparoscope_video, rigid_endoscope
+from recordings import origins
 
 from knee_gap_core.values.arrays import Image
 from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, find_field_of_view
@@ -116,24 +117,28 @@ def test_a_disc_that_grows_shrinks_or_moves_is_found_anew(centre: tuple[int, int
     np.testing.assert_allclose(field.centre, centre, atol=3)
 
 
-def test_real_rigid_endoscope(real_images: Callable[[str], list[Path]]) -> None:
-    fields = []
-    for file in real_images("sinus_endoscope/000*.jpg"):
+@pytest.mark.parametrize("origin", origins(RIGID_ENDOSCOPE))
+def test_real_rigid_endoscope(origin: str, tmp_path: Path) -> None:
+    frames, fields = rigid_endoscope(origin, tmp_path), []
+    for file in frames.files:
         field = find_field_of_view(cv2.imread(str(file)))
         assert field is not None
         fields.append([*field.centre, field.radius])
-    # The scope's own disc does not move in the picture: (994, 544), 527 px by eye.
-    np.testing.assert_allclose(fields, np.tile([994.0, 544.5, 527.0], (len(fields), 1)), atol=3.0)
+    # The scope's own disc does not move in the picture.
+    expected = np.tile([*frames.centre, frames.radius], (len(fields), 1))
+    np.testing.assert_allclose(fields, expected, atol=3.0)
 
 
-def test_real_laparoscope(real_images: Callable[[str], list[Path]]) -> None:
-    video = cv2.VideoCapture(str(real_images("laparoscope_video/endo.mp4")[0]))
+@pytest.mark.parametrize("origin", origins(LAPAROSCOPE))
+def test_real_laparoscope(origin: str, tmp_path: Path) -> None:
+    path, radius = laparoscope_video(origin, tmp_path)
+    video = cv2.VideoCapture(str(path))
     for _ in range(5):
         read, image = video.read()
         assert read
     field = find_field_of_view(image)
     assert field is not None
-    assert field.radius == pytest.approx(568, abs=5)
+    assert field.radius == pytest.approx(radius, abs=5)
     dark = find_field_of_view((image * 0.25).astype(np.uint8))
     assert dark is not None
-    assert dark.radius == pytest.approx(568, abs=12)
+    assert dark.radius == pytest.approx(radius, abs=12)

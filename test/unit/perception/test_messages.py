@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from plain_messages import header
 
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
@@ -121,9 +122,8 @@ def blank_section() -> SimpleNamespace:
 
 
 def blank_edges() -> SimpleNamespace:
-    stamp = SimpleNamespace(sec=0, nanosec=0)
     return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id=""),
+        header=header(0, ""),
         **{f"{name}_{index}": blank_vector() for name in ("bearing", "edge") for index in (0, 1)},
     )
 

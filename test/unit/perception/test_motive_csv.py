@@ -4,86 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from motive_takes import (
+    NO_BODY,
+    SINGLE_BODY,
+    THREE_BODIES,
+    Export,
+    single_body_take,
+    take_without_body,
+    three_body_take,
+)
+from recordings import origins
 from scipy.spatial.transform import Rotation
 
 from knee_gap_perception.trackers.body_source import UnknownBodyError
 from knee_gap_perception.trackers.motive_csv import TakeError, _start_time, read_take
-
-TAKES = Path(__file__).resolve().parents[4] / "shared" / "data" / "optitrack" / "motive_csv"
-
-
-def real_take(name):
-    path = TAKES / name
-    if not path.is_file():
-        pytest.skip(f"the recorded takes are not at {TAKES}")
-    return path
-
-
-class Export:
-    """Writes takes as Motive does, so that every variety can be had."""
-
-    def __init__(
-        self,
-        *,
-        version="1.23",
-        rotation="Quaternion",
-        unit="Meters",
-        parent=False,
-        timecode=False,
-        labels=True,
-        delimiter=",",
-        decimal=".",
-        newline="\r\n",
-        bodies=("scope", "tibia"),
-        start="2021-04-18 02.24.27.730 PM",
-    ):
-        self.keys = {
-            "Format Version": version,
-            "Take Name": "a take",
-            "Capture Frame Rate": "100.000000",
-            "Export Frame Rate": "100.000000",
-            "Capture Start Time": start,
-            "Total Frames in Take": "3",
-            "Total Exported Frames": "3",
-            "Rotation Type": rotation,
-            "Length Units": unit,
-            "Coordinate Space": "Global",
-        }
-        self.parent, self.timecode, self.labels = parent, timecode, labels
-        self.delimiter, self.decimal, self.newline = delimiter, decimal, newline
-        self.bodies = bodies
-        self.axes = ["X", "Y", "Z", "W"] if rotation == "Quaternion" else ["X", "Y", "Z"]
-
-    def text(self, rows, first_frame=0):
-        """`rows` hold per frame and body a rotation, a position and an error, or None where not seen."""
-        width = len(self.axes) + 4
-        before = ["", ""] + [""] * self.timecode
-
-        def heading(label, cells):
-            return ["", label if self.labels else "", *before[2:], *cells]
-
-        def per_body(values):
-            return [value for value in values for _ in range(width)]
-
-        lines = [[cell for item in self.keys.items() for cell in item], []]
-        lines.append(heading("Type", per_body(["Rigid Body"] * len(self.bodies)) + ["Marker"] * 3))
-        lines.append(heading("Name", per_body(self.bodies) + ["Unlabeled 7"] * 3))
-        lines.append(heading("ID", per_body([f"ID{name}" for name in self.bodies]) + ["C1"] * 3))
-        if self.parent:
-            lines.append(heading("Parent", [""] * (width * len(self.bodies) + 3)))
-        kinds = ["Rotation"] * len(self.axes) + ["Position"] * 3 + ["Mean Marker Error"]
-        lines.append([*before, *kinds * len(self.bodies), *["Position"] * 3])
-        axes = [*self.axes, "X", "Y", "Z", ""] * len(self.bodies)
-        lines.append(["Frame", "Time (Seconds)", *["TimeCode"] * self.timecode, *axes, "X", "Y", "Z"])
-        for index, row in enumerate(rows, start=first_frame):
-            cells = [str(index), self.number(index / 100), *["15:26:46:12.02"] * self.timecode]
-            for body in row:
-                cells += [""] * width if body is None else [self.number(value) for value in body]
-            lines.append([*cells, "", "", ""])
-        return self.newline.join(self.delimiter.join(line) for line in lines) + self.newline
-
-    def number(self, value):
-        return "" if value is None else f"{value:.6f}".replace(".", self.decimal)
 
 
 def written(tmp_path, text, encoding="utf-8"):
@@ -391,28 +325,42 @@ def test_damaged_files_are_refused_in_one_line_or_read(tmp_path):
 
 
 class TestRecordedTakes:
-    def test_version_1_21(self):
-        take = read_take(real_take("hmv-s16_v121_quat_m_rb_rbm_marker.csv"))
+    @pytest.mark.parametrize("origin", origins(SINGLE_BODY))
+    def test_version_1_21(self, origin, tmp_path):
+        known = single_body_take(origin, tmp_path)
+        take = read_take(known.path)
         (body,) = take.bodies
-        assert (take.version, len(take.time), take.exported_count) == ("1.21", 250, 250)
-        assert take.start == datetime(2016, 1, 5, 15, 49, 50, 755000, tzinfo=UTC)
+        assert body.name == known.names[0]
+        assert (take.version, take.rate) == ("1.21", known.rate)
+        assert (len(take.time), take.exported_count) == (known.frames, known.exported)
+        assert take.start == known.start
         assert body.seen.all()
-        np.testing.assert_allclose(body.position[0], [0.060002, -0.076611, 0.019150])
+        x, y, z = known.first_position
+        np.testing.assert_allclose(body.position[0], [x, -z, y])
         assert np.median(body.mean_error) < 1e-4
 
-    def test_version_1_23_with_three_bodies_and_drop_outs(self):
-        take = read_take(real_take("pathviewr_v123_quat_m_3rb.csv"))
-        assert [body.name for body in take.bodies] == ["device02", "device03", "device05"]
-        assert (len(take.time), take.exported_count) == (934, 190951)
-        assert (np.diff(take.frame) > 1).sum() == 4
-        np.testing.assert_allclose(take.time, take.frame / 100.0)
-        assert 740 < take.body("device05").seen.sum() < 760
+    @pytest.mark.parametrize("origin", origins(THREE_BODIES))
+    def test_version_1_23_with_three_bodies_and_drop_outs(self, origin, tmp_path):
+        known = three_body_take(origin, tmp_path)
+        take = read_take(known.path)
+        assert tuple(body.name for body in take.bodies) == known.names
+        assert (len(take.time), take.exported_count) == (known.frames, known.exported)
+        assert take.start == known.start
+        assert (np.diff(take.frame) > 1).sum() == known.gaps
+        np.testing.assert_allclose(take.time, take.frame / known.rate)
+        fewest, most = known.seen
+        assert fewest <= take.body(known.names[2]).seen.sum() <= most < known.frames
+        x, y, z = known.first_position
+        np.testing.assert_allclose(take.bodies[0].position[0], [x, -z, y])
         for body in take.bodies:
             assert np.isnan(body.position[~body.seen]).any(axis=1).all() or body.seen.all()
             assert (np.abs(body.position[body.seen]).max(axis=1) > 1e-3).all()
 
-    def test_a_take_without_a_body(self):
-        take = read_take(real_take("pathviewr_v123_xyz_m_unlabeled_dropouts.csv"))
+    @pytest.mark.parametrize("origin", origins(NO_BODY))
+    def test_a_take_without_a_body(self, origin, tmp_path):
+        known = take_without_body(origin, tmp_path)
+        take = read_take(known.path)
         assert take.bodies == ()
+        assert len(take.time) == known.frames
         with pytest.raises(UnknownBodyError, match="it has: none"):
             take.body("scope")

@@ -1,12 +1,13 @@
 import struct
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from natnet.data_descriptions import DataDescriptions
 from natnet.data_frame import DataFrame
 from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
+from natnet_captures import V2_CAPTURES, V3_CAPTURES, natnet_2, natnet_3
+from recordings import origins
 
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.trackers.natnet.buffer import PacketError
@@ -22,17 +23,7 @@ from knee_gap_perception.trackers.natnet.packets import (
 )
 from knee_gap_simulation.natnet import packets as server
 
-CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "data" / "optitrack"
 V3 = NatNetVersion(3, 0)
-
-
-def captured(name):
-    path = CAPTURES / name
-    if not path.is_file():
-        pytest.skip(f"the captured packets are not at {CAPTURES}")
-    return path.read_bytes()
-
-
 BODIES = [
     server.BodyInFrame(1, (0.5, 1.25, -0.75), (0.5, -0.5, 0.5, 0.5), 0.25, True),
     server.BodyInFrame(7, (8.0, 0.125, 3.0), (0.0, 0.0, 0.0, 1.0), 0.5, False),
@@ -139,55 +130,63 @@ class TestHostilePackets:
         assert issubclass(PacketError, PerceptionError)
 
 
+@pytest.mark.parametrize("origin", origins(V3_CAPTURES))
 class TestCapturedPackets:
-    def test_frame_of_natnet_3(self):
-        frame = decode_packet(captured("natnet_v3/mocapframe_packet_v3.bin"), V3)
+    def test_frame(self, origin):
+        captured = natnet_3(origin)
+        frame, truth = decode_packet(captured.frame, V3), captured.truth
         (body,) = frame.bodies
-        assert (frame.number, body.id, body.tracking_valid) == (162734, 2, True)
-        assert body.position == pytest.approx((0.1744466, 1.4471314, -0.7343040))
-        assert body.quaternion_xyzw == pytest.approx((-0.0545942, 0.5099482, 0.0437036, -0.8573577), abs=1e-6)
-        assert body.mean_error == pytest.approx(0.51522e-3, rel=1e-4)
-        assert (frame.mid_exposure_ticks, frame.transmit_ticks) == (1416497730518, 1416497748722)
-
-    def test_names_server_and_echo_of_natnet_3(self):
-        assert decode_packet(captured("natnet_v3/modeldef_packet_v3.bin"), V3).bodies == {2: "RaceQuad"}
-        info = decode_packet(captured("natnet_v3/serverinfo_packet_v3.bin"), None)
-        assert info == ServerInfo("Motive", "2.1", V3, 3312787, 1511, True, "239.255.42.99")
-        echo = decode_packet(captured("natnet_v3/echoresponse_packet_v3.bin"), None)
-        assert echo == EchoResponse(278554190, 1416498545924)
-
-    @pytest.mark.parametrize(("motive", "version"), [("1.5.0", (2, 5)), ("1.7.2", (2, 7))])
-    def test_frames_of_natnet_2(self, motive, version):
-        info = decode_packet(captured(f"natnet_v2/frame-motive-{motive}-000.bin"), None)
-        assert info.natnet_version == version
-        assert info.clock_frequency is None
-        first, second = (
-            decode_packet(captured(f"natnet_v2/frame-motive-{motive}-00{index}.bin"), info.natnet_version)
-            for index in (1, 2)
+        assert (frame.number, body.id, body.tracking_valid) == (truth.number, truth.body_id, True)
+        assert body.position == pytest.approx(truth.position)
+        assert body.quaternion_xyzw == pytest.approx(truth.quaternion_xyzw, abs=1e-6)
+        assert body.mean_error == pytest.approx(truth.mean_error, rel=1e-4)
+        assert (frame.mid_exposure_ticks, frame.transmit_ticks) == (
+            truth.mid_exposure_ticks,
+            truth.transmit_ticks,
         )
-        assert second.number == first.number + 1
-        assert first.mid_exposure_ticks is None
-        for frame in (first, second):
-            (body,) = frame.bodies
-            assert sum(value**2 for value in body.quaternion_xyzw) == pytest.approx(1.0, abs=1e-5)
-            assert body.mean_error < 1e-4
-        assert first.bodies[0].position == pytest.approx(second.bodies[0].position, abs=1e-4)
 
-    def test_requests_are_as_captured(self):
+    def test_names_server_and_echo(self, origin):
+        captured = natnet_3(origin)
+        names = decode_packet(captured.model_definitions, V3).bodies
+        assert names == {captured.truth.body_id: captured.body_name}
+        info = decode_packet(captured.server_info, None)
+        assert info == ServerInfo("Motive", "2.1", V3, 3312787, 1511, True, "239.255.42.99")
+        echo = decode_packet(captured.echo_response, None)
+        assert echo == EchoResponse(captured.echo_stamp, captured.echo_ticks)
+
+    def test_requests_are_as_captured(self, origin):
         # The sender's name and version are its own affair; the layout is not.
-        reference = captured("natnet_v3/connect_packet_v3.bin")
+        captured = natnet_3(origin)
         ours = connect_request()
-        assert ours[:2] == reference[:2]
-        assert len(ours) == len(reference) + 5  # connection options, from NatNet 4.0 on
+        assert ours[:2] == captured.connect[:2]
+        assert len(ours) == len(captured.connect) + 5  # connection options, from NatNet 4.0 on
         assert struct.unpack_from("<H", ours, 2)[0] == len(ours) - 4
-        assert echo_request(278554190) == captured("natnet_v3/echorequest_packet_v3.bin")
+        assert echo_request(captured.echo_stamp) == captured.echo_request
 
 
+@pytest.mark.parametrize("origin", origins(V2_CAPTURES))
+@pytest.mark.parametrize(("motive", "version"), [("1.5.0", (2, 5)), ("1.7.2", (2, 7))])
+def test_captured_frames_of_natnet_2(origin, motive, version):
+    greeting, *frames = natnet_2(origin, motive)
+    info = decode_packet(greeting, None)
+    assert info.natnet_version == version
+    assert info.clock_frequency is None
+    first, second = (decode_packet(data, info.natnet_version) for data in frames)
+    assert second.number == first.number + 1
+    assert first.mid_exposure_ticks is None
+    for frame in (first, second):
+        (body,) = frame.bodies
+        assert sum(value**2 for value in body.quaternion_xyzw) == pytest.approx(1.0, abs=1e-5)
+        assert body.mean_error < 1e-4
+    assert first.bodies[0].position == pytest.approx(second.bodies[0].position, abs=1e-4)
+
+
+@pytest.mark.parametrize("origin", origins(V3_CAPTURES))
 class TestServerAgainstCaptures:
     """The simulated server writes byte for byte what Motive wrote."""
 
-    def test_server_info(self):
-        data = captured("natnet_v3/serverinfo_packet_v3.bin")
+    def test_server_info(self, origin):
+        data = natnet_3(origin).server_info
         ours = server.server_info(
             (3, 0),
             frequency=3312787,
@@ -198,8 +197,8 @@ class TestServerAgainstCaptures:
         assert ours[:11] == data[:11]  # Motive leaves rubbish behind its name's end
         assert ours[260:] == data[260:]
 
-    def test_model_definitions(self):
-        data = captured("natnet_v3/modeldef_packet_v3.bin")
+    def test_model_definitions(self, origin):
+        data = natnet_3(origin).model_definitions
         read = DataDescriptions.read_from_buffer(payload(data), Version(3, 0))
         (body,) = read.rigid_bodies
         markers = [marker.pos for marker in body.markers]
@@ -211,8 +210,8 @@ class TestServerAgainstCaptures:
         assert sorted(ours) == sorted(data)  # Motive sends the body between its marker sets
         assert server.model_definitions((3, 0), server.Models(bodies=models.bodies))[8:] in data
 
-    def test_frame(self):
-        data = captured("natnet_v3/mocapframe_packet_v3.bin")
+    def test_frame(self, origin):
+        data = natnet_3(origin).frame
         read = DataFrame.read_from_buffer(payload(data), Version(3, 0))
         content = server.FrameContent(
             number=read.prefix.frame_number,

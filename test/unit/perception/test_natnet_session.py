@@ -1,8 +1,9 @@
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
+from natnet_captures import CLOCK_HZ, TRAFFIC, traffic
+from recordings import origins
 
 from knee_gap_perception.trackers.body_source import UnknownBodyError, choose_body
 from knee_gap_perception.trackers.natnet.clock import EchoClock
@@ -10,7 +11,6 @@ from knee_gap_perception.trackers.natnet.packets import MessageId
 from knee_gap_perception.trackers.natnet.session import NatNetSession
 from knee_gap_simulation.natnet import packets as server
 
-CAPTURE = Path(__file__).resolve().parents[4] / "shared/data/optitrack/natnet_v3/traffic_first_half.pcapng"
 MOTIVE = ("10.0.0.5", 1510)
 MILLISECOND = 1_000_000
 SECOND = 1_000_000_000
@@ -515,13 +515,13 @@ class TestTroubleInWords:
 
 
 class TestCapturedTraffic:
-    def test_a_recorded_conversation_is_read_to_the_end(self):
-        if not CAPTURE.is_file():
-            pytest.skip(f"no captured traffic at {CAPTURE}")
-        frames, clock, asked = [], EchoClock(3312787), 0
-        session = NatNetSession("192.168.0.106")
-        for now, sender, port, data in udp_packets(CAPTURE.read_bytes()):
-            if sender != "192.168.0.106":
+    @pytest.mark.parametrize("origin", origins(TRAFFIC))
+    def test_a_recorded_conversation_is_read_to_the_end(self, origin):
+        conversation = traffic(origin)
+        frames, clock, asked = [], EchoClock(CLOCK_HZ), 0
+        session = NatNetSession(conversation.server)
+        for now, sender, port, data in udp_packets(conversation.capture):
+            if sender != conversation.server:
                 asked = now
                 continue
             message = struct.unpack_from("<H", data)[0]
@@ -533,7 +533,7 @@ class TestCapturedTraffic:
             if message == MessageId.FRAME and clock.ready(now):
                 frames.append(session.receive(bumped(data), (sender, port), now))
         assert session.counts["malformed packets"] == 0
-        assert session.names == {2: "RaceQuad"}
+        assert session.names == conversation.names
         stamps = np.array([frame.stamp_ns for frame in frames if frame is not None])
         assert len(stamps) > 60
         assert np.median(np.diff(stamps)) == pytest.approx(8.333 * MILLISECOND, rel=0.01)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_messages import bgr_image, header, pose
 
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.poses import BodyPose, LensPose
@@ -22,33 +23,20 @@ BEGIN_NS = 10**18
 COVARIANCE = np.diag([4.5e-10] * 3 + [1.6e-9] * 3)
 
 
-def stamped(t: float) -> Any:
-    seconds, nanoseconds = divmod(BEGIN_NS + round(1e9 * t), 10**9)
-    return SimpleNamespace(
-        stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id="arthroscope_optical"
-    )
+def stamp(t: float) -> int:
+    return BEGIN_NS + round(1e9 * t)
 
 
-def image(picture: np.ndarray, t: float) -> Any:
-    height, width = picture.shape[:2]
-    return SimpleNamespace(
-        header=stamped(t), height=height, width=width, step=3 * width, encoding="bgr8", data=picture.tobytes()
-    )
-
-
-def pose(position: np.ndarray, t: float) -> Any:
-    place = SimpleNamespace(
-        position=SimpleNamespace(**dict(zip("xyz", position, strict=True))),
-        orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-    return SimpleNamespace(header=stamped(t), pose=SimpleNamespace(pose=place, covariance=COVARIANCE.ravel()))
+def posed(position: np.ndarray, t: float) -> Any:
+    covered = SimpleNamespace(pose=pose(position), covariance=COVARIANCE.ravel())
+    return SimpleNamespace(header=header(stamp(t)), pose=covered)
 
 
 def camera_info(joint: Any) -> Any:
     c = joint.camera
     k = [c.fx, 0.0, c.cx, 0.0, c.fy, c.cy, 0.0, 0.0, 1.0]
     return SimpleNamespace(
-        header=stamped(0.0), width=1280, height=720, distortion_model="equidistant", d=[0.0] * 4, k=k
+        header=header(BEGIN_NS), width=1280, height=720, distortion_model="equidistant", d=[0.0] * 4, k=k
     )
 
 
@@ -87,12 +75,12 @@ class Chain:
             body = BodyPose(BEGIN_NS + round(1e9 * (t + step)), place, np.array([0.0, 0.0, 0.0, 1.0]))
             for reported in self.tracker.take(body):
                 if isinstance(reported, LensPose):
-                    self.stream.on_lens_pose(fill_lens_pose(pose(np.zeros(3), 0.0), reported))
+                    self.stream.on_lens_pose(fill_lens_pose(posed(np.zeros(3), 0.0), reported))
                 else:
                     self.refused.append(reported.reason)
 
     def image(self, picture: np.ndarray, t: float) -> GapEdges:
-        self.stream.on_image(image(picture, t))
+        self.stream.on_image(bgr_image(picture, stamp(t)))
         (edges,) = self.stream.ready()
         self.edges.append(edges)
         return edges

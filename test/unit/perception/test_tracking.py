@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from plain_messages import header, pose
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
@@ -377,25 +378,12 @@ class TestParameters:
         assert ValidityParameters(tracker_rate=nan, jump_hold=inf).jump_hold == inf
 
 
-def blank_pose():
-    vector = SimpleNamespace(x=0.0, y=0.0, z=0.0)
-    return SimpleNamespace(
-        position=vector,
-        orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0),
-        translation=SimpleNamespace(x=0.0, y=0.0, z=0.0),
-        rotation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-
-
-def blank_header():
-    return SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
-
-
 def test_messages_carry_the_pose_there_and_back():
     body = hand_motion(4)
     lens = ScopeTracker(TrackingParameters(body_to_shaft_translation=(0.1, 0.0, 0.2))).update(body)
     message = fill_lens_pose(
-        SimpleNamespace(header=blank_header(), pose=SimpleNamespace(pose=blank_pose(), covariance=None)), lens
+        SimpleNamespace(header=header(0, ""), pose=SimpleNamespace(pose=pose(np.zeros(3)), covariance=None)),
+        lens,
     )
     read = body_pose_from_message(SimpleNamespace(header=message.header, pose=message.pose.pose), "lens")
     assert read.stamp_ns == body.stamp_ns
@@ -403,8 +391,14 @@ def test_messages_carry_the_pose_there_and_back():
     np.testing.assert_array_equal(read.position, lens.position)
     np.testing.assert_array_equal(read.quaternion_xyzw, lens.quaternion_xyzw)
     np.testing.assert_array_equal(np.reshape(message.pose.covariance, (6, 6)), lens.covariance)
+    blank = pose(np.zeros(3))
     transform = fill_lens_transform(
-        SimpleNamespace(header=blank_header(), child_frame_id="", transform=blank_pose()), lens
+        SimpleNamespace(
+            header=header(0, ""),
+            child_frame_id="",
+            transform=SimpleNamespace(translation=blank.position, rotation=blank.orientation),
+        ),
+        lens,
     )
     assert transform.child_frame_id == "arthroscope_optical"
     assert transform.transform.translation.x == lens.position[0]

@@ -1,13 +1,11 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
+from motive_takes import THREE_BODIES, three_body_take
+from recordings import origins
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_replay.import_motive import main
-
-TAKE = Path(__file__).resolve().parents[4] / "shared/data/optitrack/motive_csv/pathviewr_v123_quat_m_3rb.csv"
 
 HEADER = """Format Version,1.23,Take Name,t,Capture Start Time,{start},Total Exported Frames,3,\
 Rotation Type,Quaternion,Length Units,Millimeters,Coordinate Space,Global
@@ -90,13 +88,14 @@ def test_mistakes_are_one_line_and_leave_no_bag(tmp_path, capsys, arguments, row
     assert not out.exists()
 
 
-def test_a_recorded_take(tmp_path, capsys):
-    if not TAKE.is_file():
-        pytest.skip(f"no recorded take at {TAKE}")
+@pytest.mark.parametrize("origin", origins(THREE_BODIES))
+def test_a_recorded_take(origin, tmp_path, capsys):
+    known = three_body_take(origin, tmp_path)
+    _, body, leg_body = known.names
     out = tmp_path / "bag"
-    assert main([str(TAKE), "device03", str(out), "--reference", "device05"]) == 0
-    assert "190951 frames by the header, 934 in the file" in capsys.readouterr().err
+    assert main([str(known.path), body, str(out), "--reference", leg_body]) == 0
+    assert f"{known.exported} frames by the header, {known.frames} in the file" in capsys.readouterr().err
     scope, leg = poses(out), poses(out, "/knee_gap/reference_body/pose")
-    assert len(scope) > 925
-    assert 740 < len(leg) < 760
+    assert known.frames - 10 < len(scope) <= known.frames
+    assert known.seen[0] <= len(leg) <= known.seen[1]
     assert (np.diff([time_ns for time_ns, _ in scope]) > 0).all()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ports import free_port
 
 from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.errors import PerceptionError
@@ -20,12 +21,6 @@ from knee_gap_simulation.natnet.command import main
 from knee_gap_simulation.natnet.packets import VERSIONS
 from knee_gap_simulation.natnet.scene import CLOCK_SECONDS, Faults, TrackedScene
 from knee_gap_simulation.natnet.server import NatNetServer, ServerSettings
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Served:

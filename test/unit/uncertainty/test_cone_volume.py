@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from vectors import unit
 
 from knee_gap_uncertainty.numerics.vectors import vector
 from knee_gap_uncertainty.two_view.cone_volume import ConeVolume, farthest_point, volume_distance
 from knee_gap_uncertainty.two_view.gap_range import gap_range
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def drawn(volume, count, rng):

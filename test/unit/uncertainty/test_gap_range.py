@@ -6,15 +6,12 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vectors import unit
 
 from knee_gap_uncertainty.two_view.gap_range import cloud_range, gap_range, warm_up
 
 PSI = math.radians(2.364)
 DT = 0.0367e-3
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def scene(rng, *, gap=None, depth=None, travel=None):

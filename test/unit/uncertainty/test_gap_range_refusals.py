@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from vectors import unit
 
 from knee_gap_core.values.errors import (
     BadInputError,
@@ -19,10 +20,6 @@ from knee_gap_uncertainty.two_view.two_views import two_views
 
 DEPTH = 0.010
 ERRORS = {"angular_error": math.radians(2.364), "translation_error": 0.0367e-3}
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def look(points, travel):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vectors import unit
 
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     CONE,
@@ -209,10 +210,6 @@ def test_bounds_hold_whatever_the_admitted_errors(seed):
     )
     assert lower <= scene.gap() <= upper
     assert lower > 0.0
-
-
-def unit(vector):
-    return vector / np.linalg.norm(vector)
 
 
 @pytest.mark.parametrize("kinds", [(KIND_CONTOUR, KIND_CONTOUR), (KIND_RIM, KIND_RIM), (0, 0)])

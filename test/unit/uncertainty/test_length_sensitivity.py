@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from vectors import unit
 
 from knee_gap_uncertainty.two_view.angle_sets import SIGNS, angle_changes
 from knee_gap_uncertainty.two_view.length_sensitivity import (
@@ -15,10 +16,6 @@ from knee_gap_uncertainty.two_view.length_sensitivity import (
 from knee_gap_uncertainty.two_view.translation_volume import DIRECTIONS, displacements
 from knee_gap_uncertainty.two_view.triangulation import triangulate
 from knee_gap_uncertainty.two_view.two_views import two_views
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def triangles(count, seed=0):

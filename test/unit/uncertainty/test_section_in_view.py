@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from vectors import unit
 
 from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
 from knee_gap_core.values.poses import LensPose
@@ -13,10 +14,6 @@ from knee_gap_uncertainty.scope_calibration.posed_view import PosedView, posed_v
 POINTS = np.array([[0.0, -0.003, 0.012], [0.0, 0.003, 0.012]])
 EDGES = np.array([[0.0, -0.002, 0.0125], [0.0, 0.002, 0.0125]])
 SEEN = (EdgeState.SEEN, EdgeState.SEEN)
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def at(seconds, place=(0.0, 0.0, 0.0), states=SEEN, **changes) -> tuple[EdgeObservation, PosedView]:

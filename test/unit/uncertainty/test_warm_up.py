@@ -2,12 +2,11 @@
 
 import subprocess
 import sys
-from pathlib import Path
+
+from sample_bag import SAMPLE
 
 from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_uncertainty.warm_up import warm_up
-
-SAMPLE = Path(__file__).parents[3] / "bags" / "sample"
 
 COUNT_LATE = """
 import numba.core.dispatcher as dispatcher

@@ -40,6 +40,7 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _TIMES = struct.Struct("<QQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER = struct.Struct("<BQQQI")
+_END_SIZE = _FOOTER.size + MAGIC_SIZE
 _CHECKSUM_SIZE = 4
 _OPCODES = frozenset(int(opcode) for opcode in Opcode)
 _INDEX_ENTRY_SIZE = 16
@@ -157,7 +158,7 @@ class McapFile:
     def _summary(self) -> Summary | None:
         """Return the index at the end of the file, None where it is absent or damaged."""
         try:
-            self._file.seek(-(_FOOTER.size + MAGIC_SIZE), os.SEEK_END)
+            self._file.seek(-_END_SIZE, os.SEEK_END)
             _, _, start, _, known = _FOOTER.unpack(self._file.read(_FOOTER.size))
             if not start > MAGIC_SIZE or self._size - start > _MOST_INDEX_BYTES:
                 return None
@@ -196,12 +197,21 @@ class McapFile:
                 break
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 if opcode == Opcode.DATA_END and self.blocks and self.blocks[0].is_chunk:
-                    self._lose("the index at the end is damaged; read without it")
+                    self._note_lost_index(end)
                 return
             self._note(opcode, offset, length)
             offset = end
         rest = self._size - offset
         self._lose(f"cut or damaged at byte {offset}: {rest} bytes lost" if rest else "ends without an index")
+
+    def _note_lost_index(self, end_of_data: int) -> None:
+        """Note that the index is damaged, unless the file was written without one."""
+        self._file.seek(-_END_SIZE, os.SEEK_END)
+        opcode, _, index_start, *_ = _FOOTER.unpack(self._file.read(_FOOTER.size))
+        # What follows the data must be the end of the file, or an index that is sound and lists no chunks.
+        ends_here = opcode == Opcode.FOOTER and index_start == 0 and end_of_data == self._size - _END_SIZE
+        if not ends_here and not (end_of_data == index_start and self._summary() is not None):
+            self._lose("the index at the end is damaged; read without it")
 
     def _note(self, opcode: int, offset: int, length: int) -> None:
         if opcode == Opcode.CHUNK:

@@ -1,0 +1,10 @@
+"""Ports of this machine, for tests that talk to themselves."""
+
+import socket
+
+
+def free_port() -> int:
+    """Return a UDP port of the loopback that nobody uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
