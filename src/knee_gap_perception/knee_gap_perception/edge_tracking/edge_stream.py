@@ -169,16 +169,17 @@ class EdgeStream:
             self._waiting.append(_Waiting(message, stamp, now_ns))
             return None
         self._unanswered = _Waiting(message, stamp, now_ns)
-        image = None
+        image, counted = None, ""
         try:
             image = _read(message)
             self._refuse_other_size(image)
             observation = self._notch.look(stamp, image)
         except PerceptionError as error:
             observation = NotchObservation(stamp, nan, nan, str(error))
-        self.counts[
-            "the notch is seen" if observation.seen else f"no turn of the scope: {observation.reason}"
-        ] += 1
+            # Its words hold sizes of this image, and there are as many as images.
+            counted = "the image cannot be read"
+        counted = counted or observation.reason
+        self.counts["the notch is seen" if observation.seen else f"no turn of the scope: {counted}"] += 1
         self._waiting.append(_Waiting(message, stamp, now_ns, image, observation.seen))
         self._unanswered = None
         return observation
