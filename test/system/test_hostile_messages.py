@@ -13,7 +13,7 @@ pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped, TwistStamped
 from hostile import SETTINGS, header, hurt, names, numbers, poses, stamps, steps_ns
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sample_bag import SAMPLE, sample_camera_info
 from sensor_msgs.msg import CameraInfo, CompressedImage
-from std_msgs.msg import Float64, Header
+from std_msgs.msg import Header
 
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
@@ -160,7 +160,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Suite]:
         client.listen(GapEdges, "gap_edges")
         client.listen(GapEstimate, "gap")
         client.listen(PoseWithCovarianceStamped, "scope_pose")
-        client.listen(Float64, "leg/opening_rate")
+        client.listen(TwistStamped, "leg/command")
         client.listen(DiagnosticArray, "/diagnostics")
         processes.wait_ready(list(NODES), 120.0)
         client.wait_matched()
@@ -196,7 +196,7 @@ def test_each_node_answers_afterwards(suite: Suite) -> None:
     gaps = suite.client.received["gap"]
     seconds = suite.stamp_ns // 10**9
     suite.client.spin_until(lambda: any(gap.header.stamp.sec == seconds for gap in gaps))
-    lenses, rates = suite.client.received["scope_pose"], suite.client.received["leg/opening_rate"]
+    lenses, rates = suite.client.received["scope_pose"], suite.client.received["leg/command"]
     sent, rated = len(lenses), len(rates)
     for k in range(20):
         body = PoseStamped()

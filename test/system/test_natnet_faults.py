@@ -88,7 +88,7 @@ def test_what_is_no_measurement_is_not_published(
 
         client.spin_until(walked, timeout=40.0)
         assert max(distance_from_truth(pose) for pose in judged.poses) < CLOSE
-        reported = [one for one in judged.words() if "refused:" in one]
+        reported = [one for one in judged.words() if "rejected:" in one]
         assert reported
         if reason == "jump":
             words = "has not come back" if not any(words in one for one in reported) else words
