@@ -110,7 +110,7 @@ class TestHostilePackets:
                 decode_packet(bytes(broken), NatNetVersion(*version))
 
     def test_versions_that_are_not_known(self):
-        with pytest.raises(PacketError, match=r"NatNet 5.0; 2.x to 4.x are read"):
+        with pytest.raises(PacketError, match=r"NatNet 5.0; 2.x to 4.x are supported"):
             decode_packet(server.frame((4, 1), FULL), NatNetVersion(5, 0))
 
     def test_data_before_the_version_is_known(self):

@@ -197,7 +197,7 @@ class TestStamps:
         assert world.run(5.0) == []
         status = world.session.status(world.now)
         assert not status.ok
-        assert "delays echoes by 5.1 ms: the time of exposure is known to 2.5 ms only" in status.words
+        assert "echoes take 5.1 ms: the time of exposure is known to 2.5 ms only" in status.words
         world.way = 1 * MILLISECOND
         assert worst_stamp_error(world.run(5.0)) < MILLISECOND
 
@@ -471,7 +471,7 @@ class TestTroubleInWords:
         )
         world.session.receive(server.packet(1, info), MOTIVE, world.now)
         world.session.receive(world.motive.frame(world.now), MOTIVE, world.now)
-        assert "NatNet 5.0; 2.x to 4.x are read" in world.session.status(world.now + 2 * SECOND).words
+        assert "NatNet 5.0; 2.x to 4.x are supported" in world.session.status(world.now + 2 * SECOND).words
 
     def test_a_second_server_on_another_machine(self):
         world = World()

@@ -116,7 +116,7 @@ class TestRefusals:
     def test_too_short(self):
         series = recording(1)
         short = PoseSeries("short", series.time[:15], series.position[:15], series.quaternion_xyzw[:15])
-        with pytest.raises(PerceptionError, match="short: no stretch of poses"):
+        with pytest.raises(PerceptionError, match="short: no sequence of poses"):
             tracker_precision(short)
 
     def test_poses_that_do_not_vary(self):

@@ -64,7 +64,7 @@ def test_it_is_aligned_to_another_bag_by_an_offset(tmp_path):
 def test_a_start_that_cannot_be_read_must_be_told(tmp_path, capsys):
     path = take(tmp_path, start="wann auch immer")
     assert main([path, "scope", str(tmp_path / "bag")]) == 1
-    assert "'wann auch immer' cannot be read; say when it was with --start" in capsys.readouterr().err
+    assert "'wann auch immer' cannot be read; set it with --start" in capsys.readouterr().err
     assert main([path, "scope", str(tmp_path / "bag"), "--start", "12.5"]) == 0
     assert poses(tmp_path / "bag")[0][0] == 12_500_000_000
 
