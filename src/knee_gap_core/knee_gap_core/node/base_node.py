@@ -150,6 +150,13 @@ class BaseNode(GuardedNode):
             self.get_logger().warning(words)
 
 
+def _is_interrupted(error: BaseException | None) -> bool:
+    """Whether an exception was caused by a request to stop."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     """Start a node, spin until it is told to stop, return the exit code: 2 for a mistake of the user's."""
     try:
@@ -173,9 +180,10 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     except ConfigurationError as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return 2
-    except Exception:
-        # A signal between two looks of the executor ends the context under it, which it takes for an error.
-        if rclpy.ok():
+    except Exception as error:
+        # A signal between two looks of the executor ends the context under it, which it takes for an error;
+        # one while a kernel is loaded comes out of foreign code as an error of that.
+        if rclpy.ok() and not _is_interrupted(error):
             raise
     finally:
         if node is not None:
