@@ -19,6 +19,8 @@ from knee_gap_perception.point_tracking.point_selection import choose_points
 from knee_gap_perception.point_tracking.point_tracker import PointObservation, PointTracker
 from knee_gap_perception.point_tracking.tangent_plane import View
 
+AROUND_EDGES = 40.0  # [px] beyond the tracked points within which instruments are looked for
+
 
 @dataclass(frozen=True)
 class _Track:
@@ -237,8 +239,11 @@ class GapEdgeTracker:
         profile = bool(since_ns >= 1e9 * self.parameters.profile_period)
         if profile:
             self._profile_ns = stamp_ns
-        foreign, scale = self._search.foreign(picture)
-        return self._track.edges.find(stamp_ns, grey, foreign, scale, field, camera, pixels, profile=profile)
+        margin = AROUND_EDGES + (1.5 if profile else 0.5) * float(np.linalg.norm(pixels[1] - pixels[0]))
+        foreign, scale, origin = self._search.foreign(picture, pixels, margin)
+        return self._track.edges.find(
+            stamp_ns, grey, foreign, scale, field, camera, pixels, profile=profile, origin=origin
+        )
 
     def _settle_frame(self, pose_frame: str) -> None:
         """Let the track be begun anew where it cannot use poses in a frame.

@@ -63,10 +63,20 @@ class GapSearch:
         full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
 
-    def foreign(self, picture: Image) -> tuple[Mask, float]:
-        """Instruments and glare (h, w) in the reduced image, and its scale relative to the full image."""
-        small, scale = self._smaller(picture)
-        return foreign_bodies(small), scale
+    def foreign(self, picture: Image, around: Array, margin: float) -> tuple[Mask, float, Array]:
+        """Instruments and glare in the reduced part of an image around points (n, 2) [px].
+
+        Returns the mask (h, w), its scale relative to the full image, and the first pixel (2,) of the part.
+        The part reaches `margin` [px] beyond the points.
+        """
+        height, width = picture.shape[:2]
+        scale = min(1.0, self.parameters.working_rows / min(height, width))
+        first = np.clip(np.floor(around.min(axis=0) - margin), 0, [width - 2, height - 2]).astype(int)
+        last = np.clip(np.ceil(around.max(axis=0) + margin), first + 2, [width, height]).astype(int)
+        part = picture[first[1] : last[1], first[0] : last[0]]
+        size = tuple(max(1, round(float(side) * scale)) for side in last - first)
+        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return foreign_bodies(small), scale, first.astype(np.float64)
 
     def agreed_section(
         self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None

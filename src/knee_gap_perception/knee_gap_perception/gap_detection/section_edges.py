@@ -131,17 +131,19 @@ class SectionEdgeFinder:
         points: Array,
         *,
         profile: bool = False,
+        origin: Array | None = None,
     ) -> tuple[SectionEdges, tuple[SectionEdges, ...]]:
         """The edges at the section, and those at more sections along the opening if `profile`.
 
         `grey` (h, w) is the image exposed at a stamp [ns]; `foreign` the mask of instruments and glare,
-        reduced by `scale`; `points` (2, 2) [px] the tracked points in the image.
+        reduced by `scale`, of the image or of its part from the pixel `origin` (2,) on; `points` (2, 2)
+        [px] the tracked points in the image.
         """
         edges: SectionEdges = SectionEdges()
         more: tuple[SectionEdges, ...] = ()
         for _ in range(1 if self._settled else 4):
             centre = self._centre(points)
-            found = self._borders(grey, foreign, scale, centre, points, profile)
+            found = self._borders(grey, foreign, scale, origin, centre, points, profile)
             if found is None:
                 return SectionEdges(), ()
             rows, borders = found
@@ -173,7 +175,14 @@ class SectionEdgeFinder:
         return np.asarray(centre)
 
     def _borders(
-        self, grey: Image, foreign: Mask, scale: float, centre: Array, points: Array, profile: bool
+        self,
+        grey: Image,
+        foreign: Mask,
+        scale: float,
+        origin: Array | None,
+        centre: Array,
+        points: Array,
+        profile: bool,
     ) -> tuple[Array, tuple[Borders, Borders]] | None:
         """Lines (n,) along the opening and the borders on either side; None if none can be measured."""
         reaches = np.abs((points - centre) @ self._across) + BEYOND
@@ -197,7 +206,8 @@ class SectionEdgeFinder:
                 for share in (TISSUE_BEGINS, EARLIEST, LATEST)
             )
             ends = centre + sign * place[:, None] * self._across + strip.rows[:, None] * along
-            column, row = np.rint((ends + 0.5) * scale - 0.5).astype(int).T
+            within = ends if origin is None else ends - origin
+            column, row = np.rint((within + 0.5) * scale - 0.5).astype(int).T
             covered = foreign[row.clip(0, foreign.shape[0] - 1), column.clip(0, foreign.shape[1] - 1)]
             known = ~covered & (place < length - 2)
             sides.append(Borders(place, np.minimum(earliest, place), np.maximum(latest, place), known))
