@@ -23,7 +23,8 @@ EDGES, GAP = "/knee_gap/gap_edges", "/knee_gap/gap"
 VALID = 1
 LAST_LINE = (
     r"demo: (\d+) estimates, (\d+) valid, median \|gap - truth\| ([\d.]+) mm, "
-    r"truth inside \[min, max\] ([\d.]+) %"
+    r"truth inside \[min, max\] ([\d.]+) % \(min holds ([\d.]+) %, width ([\d.]+) mm\); "
+    r"points ([\d.]+) mm, in bounds ([\d.]+) %"
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
