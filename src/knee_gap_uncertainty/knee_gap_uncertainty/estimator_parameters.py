@@ -87,7 +87,7 @@ class EstimatorParameters:
     max_edges_silence: float = field(
         default=0.05,
         metadata={
-            "description": "time without edges after which NO_EDGES is said [s]",
+            "description": "time without edges after which NO_EDGES is published [s]",
             "range": (0.01, 10.0),
         },
     )

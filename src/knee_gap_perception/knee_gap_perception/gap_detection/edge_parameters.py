@@ -17,7 +17,7 @@ class EdgeParameters:
 
     segmentation: str = field(
         default="watershed",
-        metadata={"description": "How the dark gap is told from tissue", "choices": tuple(STRATEGIES)},
+        metadata={"description": "Segmentation method for the dark gap", "choices": tuple(STRATEGIES)},
     )
     network_path: str = field(
         default="", metadata={"description": "ONNX file for the segmentation 'onnx': image in, gap out"}

@@ -55,8 +55,8 @@ class SourceParameters:
     source: str = field(
         default="pose",
         metadata={
-            "description": "pose: geometry_msgs/PoseStamped, a topic a body; rigid_bodies: "
-            "mocap4r2_msgs/RigidBodies; natnet: straight from Motive",
+            "description": "pose: geometry_msgs/PoseStamped, one topic per body; rigid_bodies: "
+            "mocap4r2_msgs/RigidBodies; natnet: directly from Motive",
             "choices": tuple(SOURCES),
         },
     )
