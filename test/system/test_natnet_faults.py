@@ -101,7 +101,7 @@ def test_a_version_that_is_not_read_is_named_with_what_is(tmp_path: Path) -> Non
         judged = Judged(processes, client, "--claim-version", "5.0")
         client.spin_until(lambda: any("NatNet 5.0" in one for one in judged.words()), timeout=40.0)
         client.spin_until(
-            lambda: any("speaks NatNet 5.0; 2.x to 4.x are read" in one for one in judged.words()),
+            lambda: any("uses NatNet 5.0; 2.x to 4.x are supported" in one for one in judged.words()),
             timeout=40.0,
         )
         assert not judged.poses

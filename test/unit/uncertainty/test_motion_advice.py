@@ -127,7 +127,7 @@ def test_direction_is_told_in_the_lens_frame() -> None:
 
 
 def test_width_of_the_interval_as_target() -> None:
-    now = situation()
+    now = situation(0.0005)  # so short a travel leaves most of the width to the points
     target = 0.75 * width_after(now, 0.0 * SIDEWAYS)
     parameters = AdviceParameters(advice_target="width", target_width=target)
     found = MotionAdvisor(parameters).advise(now).present
@@ -137,7 +137,7 @@ def test_width_of_the_interval_as_target() -> None:
 
 
 def test_a_width_that_is_promised_has_in_it_what_lasts_over_a_track() -> None:
-    offset = 0.004 * SIDEWAYS
+    offset = 0.001 * SIDEWAYS
     plain = width_after(situation(), offset)
     assert width_after(situation()._replace(correlated_error_share=1.0), offset) > 1.02 * plain
     assert width_after(situation()._replace(scale_drift=0.02), offset) > 1.02 * plain
