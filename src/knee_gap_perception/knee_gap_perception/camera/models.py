@@ -6,6 +6,7 @@ view, x to the right, y down. A pixel or direction outside the model gives NaN.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -219,11 +220,16 @@ class PinholeCamera(_Coarseness):
             axis=-1,
         )
 
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Distorted radii on the plane z = 1, in order, and the radii that belong to them."""
+        radius = np.linspace(0.0, self.fold_radius, TABLE_SIZE)
+        return radius * self._radial(radius), radius
+
     def _undistort(self, target: Array) -> Array:
         """The inverse of `_distort`, by Newton's method from the inverse of the radial part alone."""
-        radius = np.linspace(0.0, self.fold_radius, TABLE_SIZE)
         length = np.linalg.norm(target, axis=-1, keepdims=True)
-        start = np.interp(length, radius * self._radial(radius), radius)
+        start = np.interp(length, *self._table)
         plane = target * np.divide(start, length, out=np.ones_like(length), where=length > 0)
         h = 1e-6
         right, down = np.array([h, 0.0]), np.array([0.0, h])
@@ -292,12 +298,17 @@ class FisheyeCamera(_Coarseness):
         t2 = theta * theta
         return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Radii in the image, in order, and the angles that belong to them."""
+        theta = np.linspace(0.0, self.fold_angle, TABLE_SIZE)
+        return self._radius(theta), theta
+
     def _angle(self, radius: Array) -> Array:
         """Inverse of `_radius`, by Newton's method from a table."""
         if not any(self.distortion):
             return radius
-        table = np.linspace(0.0, self.fold_angle, TABLE_SIZE)
-        theta = np.interp(radius, self._radius(table), table)
+        theta = np.interp(radius, *self._table)
         k1, k2, k3, k4 = self.distortion
         for _ in range(4):
             t2 = theta * theta
