@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array, Float32, Image
-from knee_gap_perception.point_tracking.patch_kernel import normal_equations, reweighted, structures
+from knee_gap_perception.point_tracking.patch_fit import fit_patch, placement
+from knee_gap_perception.point_tracking.patch_kernel import STEP
 
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
 ONE_SIDED, FULL_SIDED = 0.75, 0.97  # share of that window on the surface: from no weight to full
@@ -30,14 +31,6 @@ SPECK = 6.0  # times the usual detail of a surface, from which something bright 
 SPECK_RIM = 7  # [px] side of what is left out around each of its pixels
 GLARE = 246  # [grey levels] above which a pixel shows the lamp
 WINDOW = 0.55  # [-] standard deviation of a patch's weight, against its half side
-GAIN_PRIOR = 0.3  # [-] standard deviation of the contrast against the patch's
-NOISE_CORRELATION = 2.7  # factor on the variance: the residuals of neighbouring pixels are not independent
-MAXIMUM_ITERATIONS = 12
-CONVERGED = 0.02  # [px]
-FINISHING = 2  # iterations in which only gradients count that both textures have
-BLOCKS = 3  # a side, in which that is told apart
-CHANCE = 0.1  # [-] share of them, and correlation, that two textures of mere noise have in common
-LEAST_LIKENESS = 0.02  # [-] of textures that have nothing in common
 
 
 @dataclass(frozen=True)
@@ -173,91 +166,26 @@ class Patch:
         seen = cv2.warpAffine(surface.weight, matrix, (side, side), flags=flags)
         self.weight = (seen * patch_window(half_size)).astype(np.float32)
         dx, dy = gradients(self.texture)
-        # Neighbours tell nearly the same: every other pixel of every other line costs no accuracy.
-        sparse = (np.indices((side, side)) % 2 == 0).all(axis=0)
-        self._pixels = np.stack([self.texture, dx, dy, self.weight * sparse], axis=-1).astype(np.float32)
+        pixels = np.stack([self.texture, dx, dy, self.weight], axis=-1)[::STEP, ::STEP]
+        self._pixels = np.ascontiguousarray(pixels, np.float32)
 
     def find(self, surface: Surface, start: Warp, prior: Array) -> Registration:
         """The patch in another image, from a predicted warp with the covariance (6, 6) of its parameters.
 
         The parameters are position x, y [px] and shape xx, xy, yx, yy [-].
         """
-        # A step s of the patch changes the warp's parameters by -jacobian s.
-        jacobian = np.zeros((6, 6))
-        jacobian[:2, :2] = start.shape
-        jacobian[2:, 2:] = np.kron(start.shape, np.eye(2))
-        prior_information = np.zeros((7, 7))
-        prior_information[:6, :6] = jacobian.T @ np.linalg.inv(prior) @ jacobian
-        prior_information[6, 6] = 1.0 / GAIN_PRIOR**2
-        warp, gain, deviation, converged = start, 1.0, np.zeros(7), False
-        # Where the noise makes gradients, they pull as much as true ones but say nothing. Near the end the
-        # true part of them is known, and only that counts.
-        pixels, finishing = self._pixels, 0
-        for turn in range(MAXIMUM_ITERATIONS):
-            hessian, slope, statistics = self._look(pixels, surface, warp, gain)
-            precision = _likeness(statistics[2]) / (NOISE_CORRELATION * statistics[0] ** 2)
-            posterior = hessian * precision + prior_information
-            step = np.linalg.solve(posterior, slope * precision - prior_information @ deviation)
-            deviation += step
-            gain = min(max(gain + float(step[6]), 0.3), 3.0)
-            warp = _compose(warp, step[:6])
-            still = (
-                np.abs(step[:2]).max() < CONVERGED
-                and np.abs(step[2:6]).max() * self.half_size < 5 * CONVERGED
-            )
-            if finishing == FINISHING or (finishing and still):
-                converged = True
-                break
-            if finishing or still or turn >= MAXIMUM_ITERATIONS - 1 - FINISHING:
-                finishing += 1
-                pixels = self._agreed(surface, warp)
-        covariance = jacobian @ np.linalg.inv(posterior)[:6, :6] @ jacobian.T
-        statistics = self._look(self._pixels, surface, warp, gain)[2]
-        return Registration(
-            warp, (covariance + covariance.T) / 2, float(statistics[2]), float(statistics[1]), converged
+        position, shape, covariance, correlation, seen, converged = fit_patch(
+            self._pixels,
+            surface.texture,
+            surface.weight,
+            np.array(surface.origin, np.float64),
+            np.array(start.position, np.float64),
+            np.array(start.shape, np.float64, order="C"),
+            np.array(prior, np.float64, order="C"),
         )
-
-    def _agreed(self, surface: Surface, warp: Warp) -> Float32:
-        """The patch's pixels with its gradients cut down to the part that the image has as well.
-
-        Block by block: with H the structure tensor of the patch and C that of patch and image, a gradient g
-        becomes C H^-1 g, with eigenvalues from 0 to 1. The information on a shift is then C H^-1 C, and what
-        noise alone pulls to vanishes on the average (instrumental variables).
-        """
-        own, cross = structures(
-            self._pixels, surface.texture, surface.weight, self._matrix(surface, warp), BLOCKS
-        )
-        trace = np.trace(own, axis1=2, axis2=3)[..., None, None]
-        values, vectors = np.linalg.eigh(own + 1e-6 * (1.0 + trace) * np.eye(2))
-        turned = np.swapaxes(vectors, -1, -2)
-        root = (vectors * np.sqrt(values)[..., None, :]) @ turned
-        inverse = (vectors / np.sqrt(values)[..., None, :]) @ turned
-        shares, axes = np.linalg.eigh(inverse @ cross @ inverse)
-        shares = np.clip((shares - CHANCE) / (1.0 - CHANCE), 0.0, 1.0)
-        agreement = root @ ((axes * shares[..., None, :]) @ np.swapaxes(axes, -1, -2)) @ inverse
-        return reweighted(self._pixels, agreement)
-
-    def _look(self, pixels: Float32, surface: Surface, warp: Warp, gain: float) -> tuple[Array, Array, Array]:
-        return normal_equations(pixels, surface.texture, surface.weight, self._matrix(surface, warp), gain)
+        return Registration(Warp(position, shape), covariance, correlation, seen, converged)
 
     def _matrix(self, surface: Surface, warp: Warp) -> Array:
         """Matrix (2, 3) from a pixel of the patch (column, row) to one of the crop."""
-        corner = warp.position - np.array(surface.origin) - self.half_size * warp.shape.sum(axis=1)
-        return np.concatenate([warp.shape, corner[:, None]], axis=1)
-
-
-def _likeness(correlation: float) -> float:
-    """Share of the information on a shift that counts, of textures that correlate so.
-
-    The noise of both textures makes gradients that say nothing, and may lock onto each other. Found on the
-    simulated knee, where what registrations add to the error was told apart from what grows with the
-    parallax: the variance goes as the inverse of the correlation beyond chance.
-    """
-    return min(max((correlation - CHANCE) / (1.0 - CHANCE), LEAST_LIKENESS), 1.0)
-
-
-def _compose(warp: Warp, step: Array) -> Warp:
-    """Warp o step^-1, the inverse compositional update; the shape changes by a third at most."""
-    change = np.eye(2) + np.clip(step[2:].reshape(2, 2), -0.3, 0.3)
-    inverse = np.linalg.inv(change)
-    return Warp(warp.position - warp.shape @ inverse @ step[:2], warp.shape @ inverse)
+        origin = np.array(surface.origin, np.float64)
+        return placement(warp.position, np.ascontiguousarray(warp.shape), origin, float(self.half_size))

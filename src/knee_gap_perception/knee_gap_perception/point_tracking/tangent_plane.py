@@ -86,7 +86,7 @@ class TangentPlane:
         bearings = camera.bearings(corners)
         step = 0.01 / TYPICAL_DISTANCE
         planes = self.mean + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        seen = np.stack([self._see(plane, bearings, anchor, view) for plane in planes])
+        seen = self._see(planes, bearings, anchor, view)
         pixels = camera.pixels(seen)
         turned = bearings[0] @ anchor.T_world_lens[:3, :3].T @ view.T_world_lens[:3, :3]
         parallax = pixels[0, 0] - camera.pixels(turned)
@@ -136,15 +136,16 @@ class TangentPlane:
         loosened = np.linalg.inv(information)
         return mean, (loosened + loosened.T) / 2
 
-    def _see(self, plane: Array, bearings: Array, anchor: View, view: View) -> Array:
-        """Directions (n, 3) from a view of the plane's points that an anchor sees along bearings (n, 3)."""
+    def _see(self, planes: Array, bearings: Array, anchor: View, view: View) -> Array:
+        """Directions (m, n, 3) from a view, to points of planes (m, 3) along bearings (n, 3) of an anchor."""
         T_first_anchor = _inverse(self._first.T_world_lens) @ anchor.T_world_lens
         R, t = T_first_anchor[:3, :3], T_first_anchor[:3, 3]
-        local = R.T @ plane / (1.0 - plane @ t)
+        local = planes @ R / (1.0 - planes @ t)[:, None]
         T_anchor_view = _inverse(anchor.T_world_lens) @ view.T_world_lens
-        moved = bearings - (bearings @ local)[:, None] * T_anchor_view[:3, 3]
+        inverse_distances = local @ bearings.T
+        moved = bearings - inverse_distances[..., None] * T_anchor_view[:3, 3]
         # Inverse distances below zero lie behind the lens.
-        return np.where((bearings @ local > 0)[:, None], moved @ T_anchor_view[:3, :3], np.nan)
+        return np.where((inverse_distances > 0)[..., None], moved @ T_anchor_view[:3, :3], np.nan)
 
     def _pose_noise(self, camera: Camera, pixel: Array, anchor: View, view: View) -> Array:
         """What the errors of both poses do to the parameters (6, 6)."""

@@ -4,9 +4,9 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array, Image
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.point_tracking.patch_fit import BLOCKS
 from knee_gap_perception.point_tracking.patch_kernel import block_tensors
 from knee_gap_perception.point_tracking.patch_registration import (
-    BLOCKS,
     LOCAL_MEAN,
     gradients,
     patch_window,
