@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vectors import unit
 
+from knee_gap_uncertainty.instrument_gap.gap_kernels import side, widest
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     CONE,
     CONTOUR_SHAPES,
@@ -17,8 +18,6 @@ from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     flaw_of,
     instrument_gap,
     opening_of,
-    side,
-    widest,
     widest_gap,
     worst_case,
 )

@@ -11,15 +11,13 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import EdgeSection
+from knee_gap_uncertainty.instrument_gap.gap_kernels import greatest_gap, least_gap, widest
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     ROUGHNESS_BOUND,
     TILTS,
     Edges,
     Opening,
-    greatest_gap,
-    least_gap,
     opening_of,
-    widest,
 )
 
 # How fast the depth of a side may change along the opening [-]: 17 degrees.

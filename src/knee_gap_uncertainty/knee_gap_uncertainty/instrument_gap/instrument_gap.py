@@ -21,12 +21,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
+from knee_gap_uncertainty.instrument_gap.gap_kernels import (
+    TINY,
+    edge_slopes,
+    ends_over_ellipse,
+    greatest_gap,
+    least_gap,
+    mean_farther,
+    mean_side,
+    opening_between,
+    ranges_under_errors,
+    widest,
+)
 from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
-from knee_gap_uncertainty.numerics.vectors import row, vector
-from knee_gap_uncertainty.two_view.error_cloud import ring_lengths
-from knee_gap_uncertainty.two_view.triangulation import SMALLEST_ANGLE
 
 # Half angle of the cone of directions, about the direction of view, from which the instrument may come.
 CONE = np.radians(10.0)
@@ -44,20 +52,11 @@ SHAPES = {KIND_RIM: RIM_SHAPES, KIND_CONTOUR: CONTOUR_SHAPES}
 ROUGHNESS = 0.08e-3
 ROUGHNESS_BOUND = 0.12e-3
 
-# Places on the confidence ellipse of the two inverse distances at which its extremes are looked for.
-AROUND = 64
-# Errors of an edge at which the extremes of a side are looked for, from one bound to the other.
-EDGE_STEPS = 5
-
 # Angle [rad] by which a point may lie beyond its edge, and ratio of the points' distances. Beyond them it
 # is not on the tissue that ends at its edge, but on something before or behind it.
 MOST_INSET = 0.2
 MOST_RATIO = 2.5
 LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad]
-
-# Points outside the opening have a positive angle on both sides.
-SIDES = np.array([-1.0, 1.0])
-TINY = 1e-12
 
 
 class Edges(NamedTuple):
@@ -117,13 +116,7 @@ def admitted_shapes(kind: int) -> Array:
 
 def opening_of(points: Array, edges: Array) -> Opening:
     """The opening between edges (2, 3), with tracked points beside them at bearings `points` (2, 3)."""
-    view = edges[0] + edges[1]
-    view = view / max(float(np.linalg.norm(view)), TINY)
-    across = edges[1] - edges[0]
-    across = across / max(float(np.linalg.norm(across)), TINY)
-    half = float(np.arctan2(edges[1] @ across, edges[1] @ view))
-    forward, aside = points @ view, points @ across * SIDES
-    return Opening(half, np.arctan2(aside, forward) - half, np.hypot(forward, aside), view, across)
+    return Opening(*opening_between(np.ascontiguousarray(points), np.ascontiguousarray(edges)))
 
 
 def flaw_of(opening: Opening, ranges: Array, inside: float) -> str:
@@ -157,14 +150,21 @@ def instrument_gap(
     along = np.zeros((2, 6))
     along[0, :3], along[1, 3:] = rays / distances[:, None] / distances[:, None] ** 2
     inverse_covariance = along @ fit.covariance @ along.T
-    lower, upper, variance = _ends(
-        ranges, inverse_covariance, fit.bend.widening * radius, opening, edges, tilt
+    lower, upper, variance = ends_over_ellipse(
+        ranges,
+        inverse_covariance,
+        fit.bend.widening * radius,
+        opening.half,
+        opening.insets,
+        *edges.shapes,
+        tilt,
     )
     shape_variance = shape_deviation**2 + 2.0 * ROUGHNESS**2
-    edge_variance = float(np.sum((edges.deviations * _edge_slopes(ranges, opening, edges, tilt)) ** 2))
+    slopes = edge_slopes(ranges, opening.half, opening.insets, *edges.shapes, tilt)
+    edge_variance = float(np.sum((edges.deviations * slopes) ** 2))
+    # The points' errors, the edges' and the shape's are independent of each other.
     own = radius**2 * (edge_variance + shape_variance)
     total = variance + edge_variance + shape_variance
-    # The points' errors, the edges' and the shape's are independent of each other.
     point, axis = _axis(lens, ranges, opening, edges, tilt)
     return InstrumentGap(
         gap=gap,
@@ -198,47 +198,6 @@ def edge_points(lens: Array, points: Array, opening: Opening, edges: Edges) -> A
     ranges = np.linalg.norm(points - lens, axis=1) * opening.in_plane
     beyond = [mean_farther(float(ranges[n]), float(opening.insets[n]), edges.shapes[n]) for n in range(2)]
     return np.asarray(lens + (ranges + beyond)[:, None] * edges.bearings)
-
-
-def _ends(
-    ranges: Array, covariance: Array, radius: float, opening: Opening, edges: Edges, tilt: float
-) -> tuple[float, float, float]:
-    """Least and greatest gap [m] over the ellipse of the points' inverse distances, and its variance [m^2].
-
-    `covariance` (2, 2) [1/m^2] is that of the inverse distances, in which errors of motion stereo are close
-    to Gaussian.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    angles = np.linspace(0.0, 2.0 * np.pi, AROUND, endpoint=False)
-    around = np.stack([np.cos(angles), np.sin(angles)])
-    near = 1.0 / ranges[:, None] + root @ around * 0.1
-    spread = np.array([_gap_at(1.0 / column, opening, edges, tilt) for column in near.T])
-    variance = float(np.max((spread - spread.mean()) ** 2)) / 0.1**2
-    inverse = 1.0 / ranges[:, None] + radius * root @ around
-    if not (inverse > 0.0).all():
-        known = inverse[:, (inverse > 0.0).all(axis=0)]
-        found = [_gap_at(1.0 / column, opening, edges, tilt) for column in known.T]
-        return min(found, default=0.0), np.inf, variance
-    found = [_gap_at(1.0 / column, opening, edges, tilt) for column in inverse.T]
-    return min(found), max(found), variance
-
-
-def _gap_at(ranges: Array, opening: Opening, edges: Edges, tilt: float) -> float:
-    return float(at_tilt(opening.half, ranges, opening.insets, *edges.shapes, tilt)[0])
-
-
-def _edge_slopes(ranges: Array, opening: Opening, edges: Edges, tilt: float) -> Array:
-    """Change (2,) of the gap with the direction of either edge [m/rad]."""
-    step = 1e-3
-    slopes = np.zeros(2)
-    for n, angle in enumerate((opening.half + tilt, opening.half - tilt)):
-        ends = [
-            mean_side(ranges[n], angle + sign * step, opening.insets[n] - sign * step, edges.shapes[n])[0]
-            for sign in (1.0, -1.0)
-        ]
-        slopes[n] = (ends[0] - ends[1]) / (2.0 * step)
-    return slopes
 
 
 def worst_case(
@@ -295,151 +254,3 @@ def bounds_of_gap(
     lower = least_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
     upper = greatest_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
     return max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND
-
-
-@compiled
-def side(distance: float, angle: float, inset: float, radius: float, slope: float) -> float:
-    """How far out [m] an instrument comes on one side, at `angle` between its axis and the edge."""
-    beside = distance * np.sin(max(inset, 0.0))
-    farther = np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
-    return float((distance + farther) * np.sin(angle) - radius * (1.0 - np.cos(angle)))
-
-
-@compiled
-def mean_farther(distance: float, inset: float, shapes: Array) -> float:
-    """How much farther [m] an edge lies than the point beside it, as a mean over the shapes (n, 2)."""
-    total = 0.0
-    for k in range(shapes.shape[0]):
-        beside = distance * np.sin(max(inset, 0.0))
-        radius, slope = shapes[k, 0], shapes[k, 1]
-        total += np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
-    return total / shapes.shape[0]
-
-
-@compiled
-def mean_side(distance: float, angle: float, inset: float, shapes: Array) -> tuple[float, float]:
-    """Mean [m] and variance [m^2] of `side` over the admitted shapes (n, 2)."""
-    total, squares = 0.0, 0.0
-    for k in range(shapes.shape[0]):
-        value = side(distance, angle, inset, shapes[k, 0], shapes[k, 1])
-        total += value
-        squares += value * value
-    mean = total / shapes.shape[0]
-    return mean, max(squares / shapes.shape[0] - mean * mean, 0.0)
-
-
-@compiled
-def side_range(
-    near: float, far: float, angle: float, inset: float, edge_error: float, image_error: float, shapes: Array
-) -> tuple[float, float]:
-    """Least and greatest `side` [m] that the admitted errors allow.
-
-    Distances lie from `near` to `far` [m]. The edge is wrong by up to `edge_error` [rad], which moves it
-    against axis and point alike, and the point against it by up to `image_error` [rad] more. The side is not
-    monotone in the edge's error, since an edge nearer to its point lies nearer to the lens.
-    """
-    least, greatest = np.inf, -np.inf
-    for step in range(EDGE_STEPS + 1):
-        if step < EDGE_STEPS:
-            error = edge_error * (2.0 * step / (EDGE_STEPS - 1) - 1.0)
-        else:
-            # Where the point may lie on the line of sight along the edge.
-            error = min(max(inset - image_error, -edge_error), edge_error)
-        for sign in (-1.0, 1.0):
-            moved = inset - error + sign * image_error
-            for k in range(shapes.shape[0]):
-                for distance in (near, far):
-                    if distance < np.inf:
-                        value = side(distance, angle + error, moved, shapes[k, 0], shapes[k, 1])
-                    else:
-                        value = np.inf if angle + error > 0.0 else -np.inf
-                    least, greatest = min(least, value), max(greatest, value)
-    return least, greatest
-
-
-@compiled
-def at_tilt(
-    half: float, ranges: Array, insets: Array, shapes_0: Array, shapes_1: Array, tilt: float
-) -> tuple[float, float]:
-    """Gap [m] of an instrument at a tilt [rad], and the variance of the shapes [m^2]."""
-    first, variance_0 = mean_side(ranges[0], half + tilt, insets[0], shapes_0)
-    second, variance_1 = mean_side(ranges[1], half - tilt, insets[1], shapes_1)
-    return first + second, variance_0 + variance_1
-
-
-@compiled
-def widest(
-    half: float, ranges: Array, insets: Array, shapes_0: Array, shapes_1: Array, tilts: Array
-) -> tuple[float, float, float]:
-    """Largest gap [m] over the tilts, the tilt [rad] that gives it, and the deviation of the shapes there."""
-    best, at, deviation = -np.inf, 0.0, 0.0
-    for k in range(tilts.size):
-        gap, variance = at_tilt(half, ranges, insets, shapes_0, shapes_1, tilts[k])
-        if gap > best:
-            best, at, deviation = gap, tilts[k], np.sqrt(variance)
-    return best, at, deviation
-
-
-@compiled
-def ranges_under_errors(
-    travel: Array, present: Array, first: Array, angular_error: float, shifts: Array, signs: Array
-) -> tuple[Array, Array]:
-    """Least and greatest distance (2,) [m] of both points from the present lens.
-
-    Empty where an admitted error turns a bearing into the direction of travel.
-    """
-    t = vector(travel)
-    near, far = np.full(2, np.inf), np.zeros(2)
-    for n in range(2):
-        lengths, angle = ring_lengths(t, row(present, n), row(first, n), angular_error, shifts, signs)
-        if not angle > SMALLEST_ANGLE:
-            return np.empty(0), np.empty(0)
-        near[n], far[n] = np.min(lengths), np.max(lengths)
-    return near, far
-
-
-@compiled
-def least_gap(
-    near: Array,
-    far: Array,
-    half: float,
-    insets: Array,
-    edge_error: float,
-    image_error: float,
-    shapes_0: Array,
-    shapes_1: Array,
-    tilts: Array,
-) -> float:
-    """Gap [m] that is free whatever the admitted errors, at the tilt where most is.
-
-    Only within the lines of sight along the edges is tissue known to be absent.
-    """
-    best = 0.0
-    for k in range(tilts.size):
-        if abs(tilts[k]) > max(half - edge_error, 0.0):
-            continue
-        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
-        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
-        best = max(best, first[0] + second[0])
-    return best
-
-
-@compiled
-def greatest_gap(
-    near: Array,
-    far: Array,
-    half: float,
-    insets: Array,
-    edge_error: float,
-    image_error: float,
-    shapes_0: Array,
-    shapes_1: Array,
-    tilts: Array,
-) -> float:
-    """Gap [m] that no admitted error exceeds, at any tilt."""
-    best = 0.0
-    for k in range(tilts.size):
-        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
-        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
-        best = max(best, first[1] + second[1])
-    return best

@@ -15,8 +15,8 @@ from knee_gap_uncertainty.motion_advice.motion_advice import (
 PIECES = 4
 # How much longer than it took the advice rests, where it took long.
 REST = 4
-# Advice is for a hand or a robot that carries a scope: ten times a second is as often as it can be followed.
-PERIOD_NS = 100_000_000
+# Advice is for a hand or a robot that carries a scope: five times a second is as often as it can be followed.
+PERIOD_NS = 200_000_000
 
 
 class AdvicePace:

@@ -147,7 +147,18 @@ def joined(parts: Sequence[Views], common_share: float) -> Views:
         values = [getattr(part, field.name) for part in parts]
         known = [value for value in values if value is not None]
         arrays[field.name] = np.concatenate(known) if len(known) == len(parts) and _alike(known) else None
-    return Views(**arrays, common_share=common_share)  # type: ignore[arg-type]  # None where it may be
+    return _checked_before(arrays, common_share)
+
+
+def _checked_before(arrays: dict[str, Array | None], common_share: float) -> Views:
+    """Views of arrays that were checked in the views they come from: a live track joins views every image."""
+    if not 0.0 <= common_share <= 1.0:
+        raise BadInputError(f"common_share must lie in [0, 1], not {common_share!r}")
+    views = object.__new__(Views)
+    for name, value in arrays.items():
+        object.__setattr__(views, name, value)
+    object.__setattr__(views, "common_share", common_share)
+    return views
 
 
 def _alike(values: Sequence[Array]) -> bool:
