@@ -14,6 +14,7 @@ import numpy as np
 from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_core.values.edges import EdgeState, SectionEdges
 from knee_gap_perception.camera.models import Camera, bearing_jacobian
+from knee_gap_perception.gap_detection.section_kernel import circle_between, last_below
 from knee_gap_perception.image.field_of_view import FieldOfView
 
 ROW_STEP = 4.0  # [px] along the opening between the lines on which its borders are searched
@@ -34,7 +35,6 @@ WIDTH_SHARE = 0.3  # standard deviation of an edge relative to the width of its 
 BOUND = 3.0  # standard deviations
 MARGIN = 3.0  # [px] from the border of the field of view, within which an edge counts as at the border
 FOREIGN_SHARE = 0.3  # largest covered fraction of the lines of an instrument's width
-COARSE = 40  # steps of the search for the centre of the largest circle, refined three times
 STATIONS = 3  # sections to either side in a profile
 STATION_STEP = 0.6  # of the circle's radius between two of them
 
@@ -69,22 +69,8 @@ def largest_circle(rows: Array, borders: tuple[Array, Array], at: float = 0.0) -
     Borders are distances from the line through the section's centre to either side, both positive outwards;
     all lengths in pixels.
     """
-    reach = float(min(borders[0].max(), borders[1].max()))
-    offset = 0.0
-    for half in (reach, 2.0 * reach / COARSE, 4.0 * reach / COARSE**2):
-        offsets = offset + np.linspace(-half, half, COARSE + 1)
-        squares = _squared_distances(rows, borders, at, offsets)
-        room = squares.min(axis=(0, 2))
-        best = int(room.argmax())
-        offset = float(offsets[best])
-    contacts = squares[:, best].argmin(axis=1)
-    return Circle(offset, float(np.sqrt(room[best])), (int(contacts[0]), int(contacts[1])))
-
-
-def _squared_distances(rows: Array, borders: tuple[Array, Array], at: float, offsets: Array) -> Array:
-    """Squared distances (2, m, n) [px^2] of both borders from places (m,) on the line at `at`."""
-    first, second = borders[0] + offsets[:, None], borders[1] - offsets[:, None]
-    return np.asarray(np.maximum(np.stack([first, second]), 0.0) ** 2 + (rows - at) ** 2)
+    offset, radius, *contacts = circle_between(rows, borders[0], borders[1], at)
+    return Circle(offset, radius, (contacts[0], contacts[1]))
 
 
 @dataclass(frozen=True)
@@ -199,10 +185,8 @@ class SectionEdgeFinder:
             if tissue - gap < LEAST_STEP:
                 return None
             length = int(reaches[index])
-            columns = strip.middle + (sign * np.arange(length)).astype(int)
-            lines = strip.values[:, columns].astype(np.float64)
             place, earliest, latest = (
-                _last_below(lines, gap + share * (tissue - gap))
+                last_below(strip.values, strip.middle, int(sign), length, gap + share * (tissue - gap))
                 for share in (TISSUE_BEGINS, EARLIEST, LATEST)
             )
             ends = centre + sign * place[:, None] * self._across + strip.rows[:, None] * along
@@ -332,21 +316,3 @@ def _tissue_level(grey: Image, pixel: Array) -> float:
     column, row = np.rint(pixel).astype(int)
     patch = grey[max(0, row - 8) : max(0, row + 9), max(0, column - 8) : max(0, column + 9)]
     return float(np.median(patch)) if patch.size else 0.0
-
-
-def _last_below(lines: Array, threshold: float) -> Array:
-    """Distance (n,) [px] along each line (n, m) of the last crossing of a threshold, from dark to bright.
-
-    0 if a line is bright from its start, its length if it ends dark.
-    """
-    dark = lines <= threshold
-    count = lines.shape[1]
-    last = np.where(dark.any(axis=1), count - 1 - dark[:, ::-1].argmax(axis=1), -1)
-    inside = (last >= 0) & (last < count - 1)
-    index = np.clip(last, 0, count - 2)
-    row = np.arange(len(lines))
-    before, after = lines[row, index], lines[row, index + 1]
-    share = np.where(
-        after > before, (threshold - before) / np.where(after > before, after - before, 1.0), 0.0
-    )
-    return np.where(inside, index + share, np.where(last < 0, 0.0, float(count - 1)))

@@ -9,7 +9,6 @@ prediction by priors on position and shape.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +17,13 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Array, Float32, Image
 from knee_gap_perception.point_tracking.patch_fit import fit_patch, placement
 from knee_gap_perception.point_tracking.patch_kernel import STEP
+from knee_gap_perception.point_tracking.surface_kernel import (
+    details,
+    median_on_surface,
+    roughness,
+    textures,
+    tissue,
+)
 
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
 ONE_SIDED, FULL_SIDED = 0.75, 0.97  # share of that window on the surface: from no weight to full
@@ -88,56 +94,47 @@ def surface_around(
         inner = np.s_[top - row : bottom - row, left - column : right - column]
         crop[inner] = grey[top:bottom, left:right]
         valid[inner] = 1 if field_mask is None else field_mask[top:bottom, left:right]
-    raw = crop.astype(np.float32)
-    smooth = cv2.GaussianBlur(raw, (0, 0), SMOOTHING)
-    surface = valid * ((smooth > dark_below) & (smooth < GLARE))
+    smooth = cv2.GaussianBlur(crop.astype(np.float32), (0, 0), SMOOTHING)
+    found = tissue(smooth, valid, float(dark_below), float(GLARE))
     # Outside the crop counts as no surface.
-    eroded = cv2.erode(surface.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=[0.0])
-    surface = eroded.astype(np.float32)
+    surface = cv2.erode(found, np.ones((5, 5), np.uint8), borderValue=[0.0]).astype(np.float32)
     window = (_odd(LOCAL_MEAN * stretch[0]), _odd(LOCAL_MEAN * stretch[1]))
-    total = cv2.boxFilter(smooth * surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    count = cv2.boxFilter(surface, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    mean = total / np.maximum(count, 1.0)
-    detail = surface * (smooth - mean) / (mean + DARK_OFFSET)
-    sparse = mean[::4, ::4][surface[::4, ::4] > 0]
-    level = float(np.median(sparse)) if sparse.size else 0.0
-    # A highlight is brighter than the tissue around it and moves with the lamp.
-    highlight = np.clip((mean / max(level, 1.0) - HIGHLIGHT) / 0.3, 0.0, 1.0)
-    power = cv2.boxFilter(detail * detail, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    strength = np.sqrt(np.maximum(power, 0.0) / np.maximum(count, 1.0))
-    # Beside an edge the window is one-sided: the shading towards a contour would pass for texture, and slide.
-    sided = np.clip((count / (window[0] * window[1]) - ONE_SIDED) / (FULL_SIDED - ONE_SIDED), 0.0, 1.0)
-    sparkle = np.clip((smooth / np.maximum(mean, 1.0) - SPARKLE) / 0.15, 0.0, 1.0)
-    clear = surface * _without_specks(detail, surface)
-    weight = (clear * sided * (1.0 - 0.9 * np.maximum(highlight, sparkle))).astype(np.float32)
-    faint = FAINT + NOISE_SHARE * _noise(raw, surface) / (level + DARK_OFFSET)
-    return Surface(detail / (strength + faint), weight, (column, row))
+    total, count = _window_sum(smooth * surface, window), _window_sum(surface, window)
+    mean, detail, square = details(smooth, surface, total, count, DARK_OFFSET)
+    level = median_on_surface(mean, surface)
+    # Shreds that drift by are pale and near the lamp. One of them on smooth cartilage would be all the
+    # texture there is, and carry the patch away.
+    usual = max(median_on_surface(detail, surface), FAINT)
+    specks = (detail > SPECK * usual).astype(np.uint8)
+    clear = (surface > cv2.dilate(specks, np.ones((SPECK_RIM, SPECK_RIM), np.uint8))).astype(np.uint8)
+    # Noise of the pixels of the surface (Immerkaer 1996): the middle of the crop tells enough.
+    noise = float(np.sqrt(np.pi / 2) / 6) * roughness(crop, surface)
+    texture, weight = textures(
+        smooth,
+        mean,
+        detail,
+        _window_sum(square, window),
+        count,
+        clear,
+        level,
+        FAINT + NOISE_SHARE * noise / (level + DARK_OFFSET),
+        float(window[0] * window[1]),
+        # A highlight is brighter than the tissue around it and moves with the lamp. Beside an edge the window
+        # is one-sided: the shading towards a contour would pass for texture, and slide.
+        (HIGHLIGHT, SPARKLE, ONE_SIDED, FULL_SIDED),
+    )
+    return Surface(texture, weight, (column, row))
 
 
-def _without_specks(detail: Float32, surface: npt.NDArray[Any]) -> Float32:
-    """Weight (h, w) that is 0 on and around what is far brighter than any detail of the surface usually is.
-
-    Shreds that drift by are pale and near the lamp. One of them on smooth cartilage would be all the texture
-    there is, and carry the patch away.
-    """
-    few = np.abs(detail[::4, ::4][surface[::4, ::4] > 0])
-    usual = float(np.median(few)) if few.size else 0.0
-    specks = (detail > SPECK * max(usual, FAINT)).astype(np.uint8)
-    return np.asarray(1.0 - cv2.dilate(specks, np.ones((SPECK_RIM, SPECK_RIM), np.uint8)), np.float32)
+def _window_sum(values: Float32, window: tuple[int, int]) -> Float32:
+    """Sum (h, w) over the window around each pixel; nothing outside."""
+    summed = cv2.boxFilter(values, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed, np.float32)
 
 
 def _odd(size: float) -> int:
     """The odd number next to a size."""
     return 2 * max(1, round((size - 1) / 2)) + 1
-
-
-def _noise(raw: Float32, surface: npt.NDArray[Any]) -> float:
-    """Standard deviation of the noise of the pixels of the surface (Immerkaer 1996)."""
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    # The middle of the crop tells enough.
-    middle = np.s_[raw.shape[0] // 4 : -raw.shape[0] // 4, raw.shape[1] // 4 : -raw.shape[1] // 4]
-    rough = np.abs(cv2.filter2D(raw[middle], -1, kernel)[surface[middle] > 0])
-    return float(np.sqrt(np.pi / 2) / 6 * rough.mean()) if rough.size else 0.0
 
 
 def patch_window(half_size: int) -> Float32:
