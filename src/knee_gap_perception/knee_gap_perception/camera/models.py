@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_perception.camera.fisheye_kernel import fisheye_bearings, fisheye_pixels
 from knee_gap_perception.errors import PerceptionError
 
 # Largest coefficient, focal length and centre [-, px]: larger ones are not plausible, and products overflow.
@@ -61,7 +62,9 @@ class _Coarseness:
         jacobian = bearing_jacobian(self, pixel)
         if not np.isfinite(jacobian).all():
             return float("nan")
-        return float(np.linalg.norm(jacobian, ord=2))
+        # The larger singular value of a matrix (3, 2), without the price of a decomposition.
+        (a, b), (_, c) = (jacobian.T @ jacobian).tolist()
+        return float(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
 def _check_size(width_px: int, height_px: int) -> None:
@@ -299,44 +302,35 @@ class FisheyeCamera(_Coarseness):
         return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
     @cached_property
-    def _table(self) -> tuple[Array, Array]:
-        """Radii in the image, in order, and the angles that belong to them."""
-        theta = np.linspace(0.0, self.fold_angle, TABLE_SIZE)
-        return self._radius(theta), theta
+    def _matrix(self) -> Array:
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
-    def _angle(self, radius: Array) -> Array:
-        """Inverse of `_radius`, by Newton's method from a table."""
-        if not any(self.distortion):
-            return radius
-        theta = np.interp(radius, *self._table)
-        k1, k2, k3, k4 = self.distortion
-        for _ in range(4):
-            t2 = theta * theta
-            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            slope = np.where(np.abs(slope) < 1e-9, np.nan, slope)
-            theta = theta - (self._radius(theta) - radius) / slope
-        return theta
+    @cached_property
+    def _polynomial(self) -> Array:
+        return np.array(self.distortion)
+
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Radii in the image, in order, and the angles that belong to them; empty without distortion."""
+        theta = np.linspace(0.0, self.fold_angle, TABLE_SIZE if any(self.distortion) else 0)
+        return self._radius(theta), theta
 
     def bearings(self, pixels: npt.ArrayLike) -> Array:
         """Unit vectors (..., 3) seen at pixels (..., 2); NaN outside the model."""
-        plane = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
-        radius = np.linalg.norm(plane, axis=-1)
-        theta = self._angle(radius)
-        inside = (theta >= 0) & (theta < self.fold_angle)
-        inside &= np.abs(self._radius(theta) - radius) * max(self.fx, self.fy) < PIXEL_TOLERANCE
-        sine_per_radius = np.divide(np.sin(theta), radius, out=np.ones_like(radius), where=radius > 0)
-        unit = np.concatenate([plane * sine_per_radius[..., None], np.cos(theta)[..., None]], axis=-1)
-        return np.where(inside[..., None], unit, np.nan)
+        given = np.asarray(pixels, dtype=np.float64)
+        flat = np.ascontiguousarray(given.reshape(-1, 2))
+        radii, angles = self._table
+        found = fisheye_bearings(
+            flat, self._matrix, self._polynomial, self.fold_angle, radii, angles, PIXEL_TOLERANCE
+        )
+        return found.reshape((*given.shape[:-1], 3))
 
     def pixels(self, bearings: npt.ArrayLike) -> Array:
         """Pixels (..., 2) at which directions (..., 3) are seen; NaN outside the model."""
-        ray = np.asarray(bearings, dtype=np.float64)
-        side = np.linalg.norm(ray[..., :2], axis=-1)
-        theta = np.arctan2(side, ray[..., 2])
-        inside = (theta < self.fold_angle) & ((side > 0) | (ray[..., 2] > 0))
-        ratio = np.divide(self._radius(theta), side, out=np.zeros_like(side), where=side > 0)
-        plane = ray[..., :2] * ratio[..., None]
-        return np.where(inside[..., None], plane * [self.fx, self.fy] + [self.cx, self.cy], np.nan)
+        given = np.asarray(bearings, dtype=np.float64)
+        flat = np.ascontiguousarray(given.reshape(-1, 3))
+        found = fisheye_pixels(flat, self._matrix, self._polynomial, self.fold_angle)
+        return found.reshape((*given.shape[:-1], 2))
 
 
 def refracted(bearings: npt.ArrayLike, index_ratio: float) -> Array:

@@ -1,12 +1,13 @@
 """From the images of a scope to the two points of the gap: find it, choose the points, follow them."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_core.values.arrays import Array, Image
+from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.models import Camera, bearing_jacobian
@@ -294,8 +295,7 @@ class GapEdgeTracker:
 
         The track goes on after a short one, as after a point that was hidden.
         """
-        rows, columns = np.mgrid[8 : picture.shape[0] : 16, 8 : picture.shape[1] : 16]
-        inside = field.depth_inside(np.stack([columns, rows], axis=-1)) > 0
+        inside = _sparse_inside(field, (picture.shape[0], picture.shape[1]))
         try:
             check_light(picture[8::16, 8::16].max(axis=2)[inside])
         except NoPointsError:
@@ -357,3 +357,10 @@ class GapEdgeTracker:
             covariances=covariances,
             angular_error=angular_error,
         )
+
+
+@lru_cache(maxsize=4)
+def _sparse_inside(field: FieldOfView, shape: tuple[int, int]) -> Mask:
+    """Which of every 16th pixel of every 16th line, from the 8th on, lie inside the field."""
+    rows, columns = np.mgrid[8 : shape[0] : 16, 8 : shape[1] : 16]
+    return np.asarray(field.depth_inside(np.stack([columns, rows], axis=-1)) > 0)
