@@ -1,7 +1,8 @@
 """segmentation_node: images of the scope in; gap_edges (edges of the gap and two points beside them) out."""
 
 from collections.abc import Mapping, Sequence
-from time import time
+from math import inf
+from time import monotonic, time
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +37,7 @@ class SegmentationNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("segmentation_node", health=self.health)
-        transport = self.declare(TransportParameters).image_transport
+        transport = self.declare(TransportParameters)
         poses = self.declare(PoseParameters)
         edges, calibration = self.declare(EdgeParameters), self.declare(CalibrationParameters)
         camera_info = self.declare(CameraInfoParameters)
@@ -55,6 +56,9 @@ class SegmentationNode(BaseNode):
             raise ConfigurationError(str(error)) from error
         # Compiled before the first image, so that its result is not late.
         warm_up()
+        self._longest_lag_ns = round(1e9 * transport.max_image_lag)
+        self._picture_period = 1.0 / transport.picture_rate
+        self._last_picture = -inf
         self._dropped = 0
         self._sequence: int | None = None
         self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)
@@ -65,7 +69,7 @@ class SegmentationNode(BaseNode):
         kind, topic = {
             "raw": (Image, "image_raw"),
             "compressed": (CompressedImage, "image_raw/compressed"),
-        }[transport]
+        }[transport.image_transport]
         self.create_subscription(CameraInfo, "camera_info", self._stream.on_camera_info, IMAGE_QOS)
         self.create_subscription(PointStamped, "clicked_point", self.on_click, RESULT_QOS)
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
@@ -77,7 +81,8 @@ class SegmentationNode(BaseNode):
             self.on_pose,
             RESULT_QOS,
         )
-        self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
+        self._kind = kind
+        self._images = self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         reported = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
         self._calibration.publish(reported)
@@ -87,11 +92,15 @@ class SegmentationNode(BaseNode):
 
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
         """Receive an image; it is processed now, or once the pose after it has arrived."""
+        self.take_image(message, info)
+        self.publish_ready()
+
+    def take_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
+        """Hand an image to the core, which publishes nothing of it yet but its notch."""
         self.count_dropped(info.get("publication_sequence_number"))
         if (observation := self._stream.on_image(message, self.now_ns())) is not None:
             # At once, because the pose that the image waits for depends on it.
             self._notch.publish(fill_scope_notch(ScopeNotch(), observation, message.header.frame_id))
-        self.publish_ready()
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Receive a lens pose, which an image may be waiting for."""
@@ -100,14 +109,23 @@ class SegmentationNode(BaseNode):
 
     def publish_ready(self) -> None:
         """Publish the edges of the images that are ready, and the pictures that have subscribers."""
-        self.take_waiting_poses()
+        self.take_waiting()
         for edges in self._stream.ready(self.now_ns()):
             message = self.publish_edges(edges)
-            if self._mask.get_subscription_count() and (mask := self._stream.mask()) is not None:
-                self.publish_picture(self._mask, mask, "mono8", message)
-            if self._overlay.get_subscription_count() and (drawn := self._stream.overlay()) is not None:
-                self.publish_picture(self._overlay, drawn, "bgr8", message)
+            self.take_waiting()
+            self.publish_pictures(message)
         self.set_patience()
+
+    def publish_pictures(self, edges: GapEdges) -> None:
+        """Publish mask and overlay of the latest image, unless the last ones are recent or an image waits."""
+        watched = [one for one in (self._mask, self._overlay) if one.get_subscription_count()]
+        if not watched or self._stream.waiting or monotonic() - self._last_picture < self._picture_period:
+            return
+        self._last_picture = monotonic()
+        if self._mask in watched and (mask := self._stream.mask()) is not None:
+            self.publish_picture(self._mask, mask, "mono8", edges)
+        if self._overlay in watched and (drawn := self._stream.overlay()) is not None:
+            self.publish_picture(self._overlay, drawn, "bgr8", edges)
 
     def publish_edges(self, edges: Edges) -> GapEdges:
         """Publish the edges found in one image; return the message."""
@@ -130,15 +148,21 @@ class SegmentationNode(BaseNode):
             self.publish_edges(edges)
         self.set_patience()
 
-    def take_waiting_poses(self) -> None:
-        """Receive all poses that have arrived.
+    def take_waiting(self) -> None:
+        """Receive all poses and images that have arrived; drop images that are too old by then.
 
         The executor takes one message of each topic per cycle. Poses arrive twice as often as images, so on a
-        busy machine they would fall behind and be too old for every image.
+        busy machine they would fall behind and be too old for every image; and the newest image would wait
+        behind all the others.
         """
+        with self._images.handle:
+            while (taken := self._images.handle.take_message(self._kind, False)) is not None:
+                self.take_image(*taken)
         with self._poses.handle:
             while (taken := self._poses.handle.take_message(PoseWithCovarianceStamped, False)) is not None:
                 self._stream.on_lens_pose(taken[0])
+        if self._longest_lag_ns:
+            self._dropped += self._stream.drop_old(self._longest_lag_ns, self.now_ns())
 
     def now_ns(self) -> int:
         """Clock for waiting times; with use_sim_time the bag's, so that a slow replay waits longer."""
@@ -177,7 +201,7 @@ class SegmentationNode(BaseNode):
         publisher.publish(message)
 
     def count_dropped(self, number: int | None) -> None:
-        """Count the images that the middleware skipped because newer ones were waiting."""
+        """Count the images that the middleware dropped because newer ones were waiting."""
         if number is not None and self._sequence is not None and number > self._sequence + 1:
             self._dropped += number - self._sequence - 1
         self._sequence = number

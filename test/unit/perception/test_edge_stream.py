@@ -117,6 +117,27 @@ def test_waiting_images_are_few_and_keep_their_order(joint: Any, travel: Any) ->
     assert [edges.stamp_ns for edges in found] == stamps
 
 
+def test_of_images_that_lag_behind_only_the_newest_is_kept(joint: Any, travel: Any) -> None:
+    made = stream(joint, wait=0.0)
+    stamps = [k * 16 * MS for k in range(1, 5)]
+    for stamp in stamps:
+        made.on_image(bgr_image(travel[1][0], stamp), stamp)
+    assert made.drop_old(100 * MS) == 0
+    assert made.drop_old(35 * MS) == 3
+    (edges,) = made.ready(stamps[-1])
+    assert edges.stamp_ns == stamps[-1]
+    assert made.drop_old(35 * MS) == 0
+
+
+def test_images_that_wait_for_their_pose_are_not_dropped(joint: Any, travel: Any) -> None:
+    made = stream(joint)
+    still_poses(made, 4 * POSE_NS)
+    for k in range(1, 5):
+        made.on_image(bgr_image(travel[1][0], 4 * POSE_NS + k * MS), now_ns=0)
+    assert made.drop_old(1 * MS, now_ns=MS) == 0
+    assert made.waiting == 4
+
+
 def test_a_track_begun_without_poses_is_begun_anew_with_them_once(joint: Any, travel: Any) -> None:
     made = stream(joint, wait=0.0)
     ids, used = [], []

@@ -191,13 +191,32 @@ class EdgeStream:
         """
         while self._waiting:
             waiting = self._waiting[0]
-            waited_ns = now_ns - waiting.arrival_ns
-            # A clock that ran backwards tells nothing of the wait.
-            in_time = 0 <= waited_ns < self._wait_ns and len(self._waiting) <= MOST_WAITING
-            if in_time and waiting.expects_pose and self._poses.expects_after(waiting.stamp_ns):
+            if self._must_wait(waiting, now_ns):
                 return
             self._waiting.popleft()
             yield self._look(waiting)
+
+    def drop_old(self, longest_lag_ns: int, now_ns: int = 0) -> int:
+        """Drop the images before the newest that need not wait, if the first of them lags too far behind it.
+
+        A live node that is starved calls this before `ready`: the newest image is worth more than the oldest.
+        Ages are told by the images' own stamps. Returns how many were dropped; they get no edges.
+        """
+        free = 0
+        while free < len(self._waiting) and not self._must_wait(self._waiting[free], now_ns):
+            free += 1
+        if free < 2 or self._waiting[free - 1].stamp_ns - self._waiting[0].stamp_ns <= longest_lag_ns:
+            return 0
+        for _ in range(free - 1):
+            self._waiting.popleft()
+        return free - 1
+
+    def _must_wait(self, waiting: _Waiting, now_ns: int) -> bool:
+        """Whether the lens pose after an image is still to be waited for."""
+        waited_ns = now_ns - waiting.arrival_ns
+        # A clock that ran backwards tells nothing of the wait.
+        in_time = 0 <= waited_ns < self._wait_ns and len(self._waiting) <= MOST_WAITING
+        return in_time and waiting.expects_pose and self._poses.expects_after(waiting.stamp_ns)
 
     def finish(self) -> Iterator[GapEdges]:
         """Edges of the images for which no pose will come any more."""

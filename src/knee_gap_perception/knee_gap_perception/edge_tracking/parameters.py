@@ -17,6 +17,21 @@ class TransportParameters:
             "choices": ("raw", "compressed"),
         },
     )
+    max_image_lag: float = field(
+        default=0.035,
+        metadata={
+            "description": "Where images come faster than they are answered: by how much an image may be "
+            "older than the newest one before it is dropped for it; 0: none is dropped [s]",
+            "range": (0.0, 1.0),
+        },
+    )
+    picture_rate: float = field(
+        default=15.0,
+        metadata={
+            "description": "Most masks and overlays a second, each made while no image waits [1/s]",
+            "range": (0.1, 100.0),
+        },
+    )
 
     def __post_init__(self) -> None:
         check_parameters(self)

@@ -272,7 +272,9 @@ def _level(grey: Image, position: Array) -> float:
     """Brightness of the tissue around a pixel: the upper quartile of a sparse neighbourhood."""
     row, column = round(float(position[1])), round(float(position[0]))
     patch = grey[max(0, row - 24) : row + 25 : 4, max(0, column - 24) : column + 25 : 4]
-    return float(np.percentile(patch, 75)) if patch.size else 0.0
+    # Sorted: numpy's percentile costs ten times as much on so few.
+    ordered = np.sort(patch, axis=None)
+    return float(ordered[(3 * (ordered.size - 1)) // 4]) if ordered.size else 0.0
 
 
 def _spread(prediction: Prediction) -> float:
