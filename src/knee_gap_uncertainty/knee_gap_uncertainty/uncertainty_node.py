@@ -25,7 +25,7 @@ from knee_gap_uncertainty.warm_up import warm_up
 # A controller that asks for this deadline or a longer one is told by the middleware when the node is dead.
 GAP_DEADLINE = Duration(nanoseconds=100_000_000)
 # How often time is let pass when no message does it [s].
-TICK = 0.01
+TICK = 0.02
 
 
 class UncertaintyNode(BaseNode):

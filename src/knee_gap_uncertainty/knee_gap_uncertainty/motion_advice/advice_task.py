@@ -11,8 +11,8 @@ from knee_gap_uncertainty.motion_advice.motion_advice import (
     Situation,
 )
 
-# Pieces a turn, each of about a millisecond: at 100 turns a second five pieces of advice are made in one.
-PIECES = 4
+# Pieces a turn, each of a fraction of a millisecond: at 50 turns a second advice takes a fifth of a second.
+PIECES = 8
 # How much longer than it took the advice rests, where it took long.
 REST = 4
 # Advice is for a hand or a robot that carries a scope: five times a second is as often as it can be followed.
