@@ -202,8 +202,7 @@ def test_a_point_is_chosen_and_a_track_ended_by_service(feed: Feed, frames: list
         ("overexposed", {LOW_CONTRAST}, "overexposed"),
         ("all glare", {LOW_CONTRAST, NO_GAP}, ""),
         ("closed joint", {NO_GAP}, ""),
-        ("16 bits", {UNKNOWN}, "8 bits"),
-        ("Bayer", {UNKNOWN}, "Bayer"),
+        ("depth", {UNKNOWN}, "depth"),
         ("camera_info of another size", {UNKNOWN}, "camera_info is for"),
         ("camera_info of no model", {UNKNOWN}, ""),
     ],
@@ -222,8 +221,7 @@ def test_a_picture_that_shows_no_points_is_told(
         "overexposed": (np.where(field, 254, good).astype(np.uint8), "bgr8"),
         "all glare": (np.where(field, cv2.GaussianBlur(glare, (0, 0), 3)[..., None], good), "bgr8"),
         "closed joint": (noisy(np.where(field, (110, 130, 160), 0).astype(np.uint8)), "bgr8"),
-        "16 bits": (good[..., 0].astype(np.uint16), "mono16"),
-        "Bayer": (good[..., 0].copy(), "bayer_rggb8"),
+        "depth": (good[..., 0].astype(np.uint16), "16UC1"),
     }.get(name, (good, "bgr8"))
     if name == "camera_info of another size":
         feed.camera(1920, 1080)
@@ -245,7 +243,9 @@ def test_a_picture_that_shows_no_points_is_told(
     feed.processes.check("segmentation_node")
 
 
-@pytest.mark.parametrize("name", ["letter-boxed", "small, in a corner", "turned", "mono", "rgb", "bgra"])
+@pytest.mark.parametrize(
+    "name", ["letter-boxed", "small, in a corner", "turned", "mono", "mono16", "Bayer", "rgb", "bgra"]
+)
 def test_an_unusual_picture_gives_points_all_the_same(
     feed: Feed, frames: list[np.ndarray], name: str
 ) -> None:
@@ -254,11 +254,15 @@ def test_an_unusual_picture_gives_points_all_the_same(
     letterbox = good.copy()
     letterbox[:90], letterbox[-90:] = 0, 0
     turned = cv2.warpAffine(good, cv2.getRotationMatrix2D((639.5, 359.5), 67.0, 1.0), (1280, 720))
+    mosaic = good[..., 1].copy()
+    mosaic[0::2, 0::2], mosaic[1::2, 1::2] = good[0::2, 0::2, 2], good[1::2, 1::2, 0]
     picture, encoding = {
         "letter-boxed": (letterbox, "bgr8"),
         "small, in a corner": (grown(good, 350, 20), "bgr8"),
         "turned": (turned, "bgr8"),
         "mono": (cv2.cvtColor(good, cv2.COLOR_BGR2GRAY), "mono8"),
+        "mono16": (cv2.cvtColor(good, cv2.COLOR_BGR2GRAY).astype(np.uint16) << 8, "mono16"),
+        "Bayer": (mosaic, "bayer_rggb8"),
         "rgb": (cv2.cvtColor(good, cv2.COLOR_BGR2RGB), "rgb8"),
         "bgra": (cv2.cvtColor(good, cv2.COLOR_BGR2BGRA), "bgra8"),
     }[name]

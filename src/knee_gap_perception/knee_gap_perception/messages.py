@@ -12,17 +12,7 @@ from knee_gap_core.values.edges import GapEdges, SectionEdges
 from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
-
-# Channels of each accepted encoding, and its conversion to blue, green, red.
-ENCODINGS: dict[str, tuple[int, int | None]] = {
-    "bgr8": (3, None),
-    "rgb8": (3, cv2.COLOR_RGB2BGR),
-    "bgra8": (4, cv2.COLOR_BGRA2BGR),
-    "rgba8": (4, cv2.COLOR_RGBA2BGR),
-    "mono8": (1, cv2.COLOR_GRAY2BGR),
-    "8UC1": (1, cv2.COLOR_GRAY2BGR),
-    "8UC3": (3, None),
-}
+from knee_gap_perception.image.encodings import decoded
 
 
 def refuse_stamp(header: Any) -> None:
@@ -31,45 +21,19 @@ def refuse_stamp(header: Any) -> None:
         raise PerceptionError(f"a stamp's nanoseconds must be below 1000000000, not {header.stamp.nanosec}")
 
 
-def _refuse_encoding(encoding: str) -> None:
-    """Raise PerceptionError unless the encoding is supported."""
-    if encoding in ENCODINGS:
-        return
-    choices = ", ".join(ENCODINGS)
-    if encoding.startswith("bayer"):
-        raise PerceptionError(f"a Bayer image ('{encoding}') must be debayered first, to one of {choices}")
-    if "16" in encoding or "32" in encoding or "64" in encoding:
-        raise PerceptionError(
-            f"an image must have 8 bits per channel, not '{encoding}'; supported encodings: {choices}"
-        )
-    raise PerceptionError(f"the image encoding must be one of {choices}, not '{encoding}'")
-
-
 def image_from_message(message: Any) -> Image:
     """Image (height, width, 3), blue green red, of a sensor_msgs/Image.
 
-    Raises PerceptionError for unsupported encodings, empty images, and data that do not fill the image.
+    Raises PerceptionError as `decoded`.
     """
-    encoding = str(message.encoding)
-    _refuse_encoding(encoding)
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    channels, conversion = ENCODINGS[encoding]
-    if height < 1 or width < 1:
-        raise PerceptionError(f"an image must have at least 1x1 px, not {width}x{height} px")
-    if step < width * channels:
-        raise PerceptionError(
-            f"{width} px in {encoding} take {width * channels} bytes per row, but the image's step is {step}"
-        )
-    data = np.frombuffer(message.data, dtype=np.uint8)
-    if data.size < height * step:
-        raise PerceptionError(
-            f"{height} rows of {step} bytes need {height * step} bytes, the image has {data.size}"
-        )
-    rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    pixels = rows.reshape(height, width, channels)
-    if conversion is None:
-        return np.ascontiguousarray(pixels)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), dtype=np.uint8)
+    return decoded(
+        message.data,
+        str(message.encoding),
+        int(message.height),
+        int(message.width),
+        int(message.step),
+        big_endian=bool(getattr(message, "is_bigendian", False)),
+    )
 
 
 def image_from_compressed(message: Any) -> Image:
@@ -80,8 +44,8 @@ def image_from_compressed(message: Any) -> Image:
     """
     description = str(message.format)
     encoding = description.split(";")[0].strip()
-    if encoding.startswith("bayer"):
-        _refuse_encoding(encoding)
+    if encoding.startswith("bayer") and "compressed bgr8" not in description:
+        raise PerceptionError(f"a compressed Bayer image ('{description}') must be debayered first")
     if "compressedDepth" in description:
         raise PerceptionError(f"a depth image ('{description}') is not an image of the scope")
     data = np.frombuffer(message.data, dtype=np.uint8)

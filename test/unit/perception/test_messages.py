@@ -54,15 +54,59 @@ def test_mono_becomes_grey(picture: Image) -> None:
         np.testing.assert_array_equal(image[..., channel], grey)
 
 
+YUV = (40, 120, 180)  # one colour, as brightness and two colour differences
+BLUE_GREEN_RED = (12, 0, 111)  # the same by ITU-R BT.601
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("yuv422", np.tile(np.array([YUV[1], YUV[0], YUV[2], YUV[0]], np.uint8), (4, 4))),
+        ("uyvy", np.tile(np.array([YUV[1], YUV[0], YUV[2], YUV[0]], np.uint8), (4, 4))),
+        ("yuv422_yuy2", np.tile(np.array([YUV[0], YUV[1], YUV[0], YUV[2]], np.uint8), (4, 4))),
+        ("yuyv", np.tile(np.array([YUV[0], YUV[1], YUV[0], YUV[2]], np.uint8), (4, 4))),
+        ("nv12", np.array([[YUV[0]] * 8] * 4 + [[YUV[1], YUV[2]] * 4] * 2, np.uint8)),
+        ("nv21", np.array([[YUV[0]] * 8] * 4 + [[YUV[2], YUV[1]] * 4] * 2, np.uint8)),
+    ],
+)
+@pytest.mark.parametrize("padding", [0, 3])
+def test_colour_of_capture_cards(encoding: str, data: Image, padding: int) -> None:
+    given = message(data, encoding, padding)
+    given.height, given.width = 4, 8
+    image = image_from_message(given)
+    assert image.shape == (4, 8, 3)
+    np.testing.assert_allclose(image.astype(int), np.broadcast_to(BLUE_GREEN_RED, image.shape), atol=3)
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_bayer_patterns_give_the_colour_of_their_filters(pattern: str, bits: int) -> None:
+    colour = {"b": 30, "g": 90, "r": 200}
+    tile = np.array([colour[one] for one in pattern]).reshape(2, 2)
+    pixels = np.tile(tile, (6, 6))
+    data = pixels.astype(np.uint8) if bits == 8 else (pixels << 8).astype("<u2")
+    image = image_from_message(message(np.ascontiguousarray(data), f"bayer_{pattern}{bits}"))
+    np.testing.assert_array_equal(image[2:-2, 2:-2], np.broadcast_to((30, 90, 200), (8, 8, 3)))
+
+
+def test_of_16_bits_the_upper_eight_are_kept_in_either_order(picture: Image) -> None:
+    grey = picture[..., 0]
+    for order, big_endian in (("<u2", False), (">u2", True)):
+        given = message((grey.astype(np.uint16) << 8 | 7).astype(order), "mono16")
+        given.is_bigendian = big_endian
+        np.testing.assert_array_equal(image_from_message(given)[..., 1], grey)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"encoding": "bayer_rggb8"}, "Bayer.*debayered"),
-        ({"encoding": "mono16"}, "8 bits"),
-        ({"encoding": "16UC3"}, "8 bits"),
-        ({"encoding": "32FC1"}, "8 bits"),
+        ({"encoding": "16UC1"}, "depth"),
+        ({"encoding": "16UC3"}, "one of bgr8"),
+        ({"encoding": "32FC1"}, "one of bgr8"),
         ({"encoding": ""}, "one of bgr8"),
-        ({"encoding": "yuv422_yuy2"}, "one of bgr8"),
+        ({"encoding": "yuv422", "width": 15}, "multiple of 2x1"),
+        ({"encoding": "nv12", "height": 11}, "multiple of 2x2"),
+        ({"encoding": "nv12", "height": 12, "data": bytes(12 * 48)}, "18 rows"),
         ({"height": 0}, "1x1"),
         ({"width": 0}, "1x1"),
         ({"step": 10}, "step"),
