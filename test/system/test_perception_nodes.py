@@ -219,7 +219,9 @@ def test_mistaken_parameters_end_the_start_in_one_line(arguments: list[str], wor
     assert len(ours) == 1, done.stderr
 
 
-def test_images_compressed(frames: list[np.ndarray], camera: CameraInfo, tmp_path: Path) -> None:
+def test_inputs_that_nobody_publishes_are_named_and_compressed_images_are_found(
+    frames: list[np.ndarray], camera: CameraInfo, tmp_path: Path
+) -> None:
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         command = [
             executable("knee_gap_perception", "segmentation_node"),
@@ -227,8 +229,11 @@ def test_images_compressed(frames: list[np.ndarray], camera: CameraInfo, tmp_pat
             "-r",
             "__ns:=/knee_gap",
         ]
-        command += ["-p", "image_transport:=compressed", "-p", "medium:=air"]
+        command += ["-p", "medium:=air"]
         processes.start("segmentation_node", command)
+        client.listen(DiagnosticArray, "/diagnostics")
+        nobody = "nobody publishes /knee_gap/camera_info, /knee_gap/image_raw;"
+        client.spin_until(lambda: any(nobody in words for words in said(client)), 120.0)
         client.offer(CompressedImage, "image_raw/compressed")
         client.offer(CameraInfo, "camera_info")
         client.listen(GapEdges, "gap_edges")
@@ -245,3 +250,11 @@ def test_images_compressed(frames: list[np.ndarray], camera: CameraInfo, tmp_pat
         client.spin_until(lambda: len(client.received["gap_edges"]) >= 3)
         statuses = [edges.status for edges in client.received["gap_edges"]]
         assert statuses == [GapEdges.STATUS_UNKNOWN, GapEdges.STATUS_UNKNOWN, GapEdges.STATUS_VALID]
+        client.received["/diagnostics"].clear()
+        client.spin_until(lambda: bool(said(client)))
+        assert not any("nobody publishes" in words for words in said(client))
+
+
+def said(client: Client) -> list[str]:
+    """What the node has said of itself."""
+    return [status.message for array in client.received["/diagnostics"] for status in array.status]

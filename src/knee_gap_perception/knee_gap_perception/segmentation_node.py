@@ -7,6 +7,7 @@ from time import monotonic, time
 import numpy as np
 import numpy.typing as npt
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
@@ -30,6 +31,10 @@ from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
 from knee_gap_perception.warm_up import warm_up
+
+TRANSPORTS = {"raw": (Image, "image_raw"), "compressed": (CompressedImage, "image_raw/compressed")}
+# How often it is looked which of them is published, until one is [s].
+TRANSPORT_LOOK = 0.1
 
 
 class SegmentationNode(BaseNode):
@@ -66,11 +71,9 @@ class SegmentationNode(BaseNode):
             self._notch = self.create_publisher(ScopeNotch, "scope_notch", RESULT_QOS)
         self._mask = self.create_publisher(Image, "gap_mask", IMAGE_QOS)
         self._overlay = self.create_publisher(Image, "~/overlay", IMAGE_QOS)
-        kind, topic = {
-            "raw": (Image, "image_raw"),
-            "compressed": (CompressedImage, "image_raw/compressed"),
-        }[transport.image_transport]
         self.create_subscription(CameraInfo, "camera_info", self._stream.on_camera_info, IMAGE_QOS)
+        if self._stream.calibration is None:
+            self.watch_input("camera_info")
         self.create_subscription(PointStamped, "clicked_point", self.on_click, RESULT_QOS)
         self.create_service(ChoosePoint, "choose_point", self.on_choose)
         self.create_service(Trigger, "restart", self.on_restart)
@@ -81,14 +84,42 @@ class SegmentationNode(BaseNode):
             self.on_pose,
             RESULT_QOS,
         )
-        self._kind = kind
-        self._images = self.create_subscription(kind, topic, self.on_image, IMAGE_QOS)
+        self._is_auto = transport.image_transport == "auto"
+        self.subscribe_to_images("raw" if self._is_auto else transport.image_transport)
         self._calibration = self.create_publisher(ScopeCalibration, "scope_calibration", LATCHED_QOS)
         reported = fill_scope_calibration(ScopeCalibration(), "segmentation_node", self._stream.calibration)
         self._calibration.publish(reported)
         # Runs while an image waits for its pose, so that it does not wait too long.
         self._patience = self.create_timer(max(poses.max_pose_wait, 0.001), self.publish_ready)
         self._patience.cancel()
+
+    def subscribe_to_images(self, transport: str) -> None:
+        """Subscribe to the images of a transport, raw or compressed."""
+        self._transport = transport
+        self._kind, topic = TRANSPORTS[transport]
+        self._images = self.create_subscription(self._kind, topic, self.on_image, IMAGE_QOS)
+        self.watch_input(topic)
+        if self._is_auto:
+            # By the steady clock: a bag's may stand still before the first image.
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._transport_timer = self.create_timer(TRANSPORT_LOOK, self.choose_transport, clock=clock)
+
+    def choose_transport(self) -> None:
+        """Change to the other transport where only that one is published, until the first image comes."""
+        other = next(name for name in TRANSPORTS if name != self._transport)
+        published = {
+            name: self.count_publishers(self.resolve_topic_name(topic)) > 0
+            for name, (_, topic) in TRANSPORTS.items()
+        }
+        if self._stream.latest is None and not published[self._transport]:
+            if not published[other]:
+                return
+            self.forget_input(TRANSPORTS[self._transport][1])
+            self.destroy_subscription(self._images)
+            self.get_logger().info(f"{TRANSPORTS[other][1]} is published: image_transport is {other}")
+            self._is_auto = False
+            self.subscribe_to_images(other)
+        self._transport_timer.cancel()
 
     def on_image(self, message: Image | CompressedImage, info: Mapping[str, int | None]) -> None:
         """Receive an image; it is processed now, or once the pose after it has arrived."""

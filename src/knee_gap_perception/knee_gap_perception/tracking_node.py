@@ -95,6 +95,7 @@ class TrackingNode(BaseNode):
         self.create_subscription(
             kind, subscription.topic, partial(self.on_message, subscription.put), TRACKER_QOS
         )
+        self.watch_input(subscription.topic)
 
     def on_message(self, put: Any, message: Any) -> None:
         """Pass a message to the source, and publish the poses of the frames that it completes."""

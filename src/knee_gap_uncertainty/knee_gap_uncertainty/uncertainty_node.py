@@ -57,6 +57,8 @@ class UncertaintyNode(BaseNode):
         self.create_subscription(PoseWithCovarianceStamped, "scope_pose", self.on_pose, RESULT_QOS)
         if self._estimator.parameters.leg_motion > 0.0:
             self.create_subscription(PoseStamped, "leg_body/pose", self.on_leg_pose, TRACKER_QOS)
+        self.watch_input("gap_edges")
+        self.watch_input("scope_pose")
         # Latched by two nodes: of each the last word is wanted.
         calibration_qos = QoSProfile(
             depth=8, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability

@@ -117,6 +117,8 @@ class BaseNode(GuardedNode):
         self._diagnostics_timer = self.create_timer(1.0, self.publish_diagnostics)
         self._reasons_logged: set[str] = set()
         self._faults_before = 0
+        # Topics that the node cannot do without, with the number of diagnostics since one was last published.
+        self._inputs: dict[str, int] = {}
 
     def declare(self, kind: type[Parameters]) -> Parameters:
         """Declare the fields of the dataclass `kind` as read-only parameters; return their values."""
@@ -132,6 +134,9 @@ class BaseNode(GuardedNode):
         if (faults := self.seam.counts.total()) > self._faults_before:
             well, words = False, f"{faults - self._faults_before} messages refused by a fault; {words}"
         self._faults_before = faults
+        if missing := self._unpublished_inputs():
+            well, words = False, f"nobody publishes {', '.join(missing)}; {words}"
+            self.log_once(f"nobody publishes {missing}", f"nobody publishes {', '.join(missing)}")
         counts = {**counts, **self.seam.counts}
         status = DiagnosticStatus(
             level=DiagnosticStatus.OK if well else DiagnosticStatus.WARN,
@@ -142,6 +147,20 @@ class BaseNode(GuardedNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+    def watch_input(self, topic: str) -> None:
+        """Say in log and diagnostics where nobody publishes a topic that the node cannot do without."""
+        self._inputs[self.resolve_topic_name(topic)] = 0
+
+    def forget_input(self, topic: str) -> None:
+        """No longer watch a topic."""
+        self._inputs.pop(self.resolve_topic_name(topic), None)
+
+    def _unpublished_inputs(self) -> list[str]:
+        """Watched topics that nobody has published for two diagnostics, so two seconds."""
+        for topic in self._inputs:
+            self._inputs[topic] = 0 if self.count_publishers(topic) else self._inputs[topic] + 1
+        return [topic for topic, unpublished in self._inputs.items() if unpublished >= 2]
 
     def log_once(self, reason: str, words: str) -> None:
         """Log `words` the first time that `reason` comes; later ones are counted in the diagnostics only."""

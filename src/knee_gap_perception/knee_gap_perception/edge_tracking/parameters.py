@@ -11,10 +11,11 @@ class TransportParameters:
     """How images reach the node. Raises PerceptionError for a choice that there is not."""
 
     image_transport: str = field(
-        default="raw",
+        default="auto",
         metadata={
-            "description": "raw subscribes to image_raw, compressed to image_raw/compressed",
-            "choices": ("raw", "compressed"),
+            "description": "raw subscribes to image_raw, compressed to image_raw/compressed, auto to the one "
+            "that is published, and to image_raw where both are",
+            "choices": ("auto", "raw", "compressed"),
         },
     )
     max_image_lag: float = field(
