@@ -18,14 +18,14 @@ def _radius_of(theta: float, k: Array) -> float:
 
 def _angle_of(radius: float, k: Array, radii: Array, angles: Array) -> float:
     """Inverse of `radius_of`, from a table (n,) of it; NaN where the curve is level."""
-    theta = np.interp(radius, radii, angles)
+    theta = float(np.interp(radius, radii, angles))
     for _ in range(STEPS):
         t2 = theta * theta
         slope = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
         if abs(slope) < 1e-9:
             return np.nan
         theta = theta - (radius_of(theta, k) - radius) / slope
-    return float(theta)
+    return theta
 
 
 def _fisheye_bearings(

@@ -94,7 +94,7 @@ def surface_around(
         inner = np.s_[top - row : bottom - row, left - column : right - column]
         crop[inner] = grey[top:bottom, left:right]
         valid[inner] = 1 if field_mask is None else field_mask[top:bottom, left:right]
-    smooth = cv2.GaussianBlur(crop.astype(np.float32), (0, 0), SMOOTHING)
+    smooth = np.asarray(cv2.GaussianBlur(crop.astype(np.float32), (0, 0), SMOOTHING), np.float32)
     found = tissue(smooth, valid, float(dark_below), float(GLARE))
     # Outside the crop counts as no surface.
     surface = cv2.erode(found, np.ones((5, 5), np.uint8), borderValue=[0.0]).astype(np.float32)

@@ -46,7 +46,7 @@ def _median_on_surface(values: Float32, surface: Float32) -> float:
             if surface[i, j] > 0:
                 sparse[count] = abs(values[i, j])
                 count += 1
-    return np.float64(np.median(sparse[:count])) if count else 0.0
+    return float(np.median(sparse[:count])) if count else 0.0
 
 
 def _textures(
@@ -96,7 +96,7 @@ def _roughness(crop: Image, surface: Float32) -> float:
                 for k in (-1, 1):
                     rough -= 2 * (np.int64(crop[i + k, j]) + np.int64(crop[i, j + k]))
                     rough += np.int64(crop[i + k, j - 1]) + np.int64(crop[i + k, j + 1])
-                total += abs(rough)
+                total += float(abs(rough))
                 count += 1
     return total / count if count else 0.0
 
