@@ -1,7 +1,6 @@
 """The demo: a bag played in real time to the live nodes over DDS, and their output compared with truth."""
 
 import os
-import shutil
 import signal
 import sys
 import time
@@ -27,7 +26,8 @@ RECORDED = (
     GAP,
     *(f"{GAP}/{name}" for name in ("min", "max", "snr")),
 )
-RECORDING = "gap.mcap"
+# A bag folder; its file is gap_0.mcap.
+RECORDING = "gap"
 # Time allowed for the nodes to start [s]: the first start after a build compiles the kernels.
 START_TIMEOUT = 120.0
 # Longest time that segmentation_node waits for the pose after an image [s].
@@ -40,7 +40,9 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
     # A ROS domain of its own, so that it does not receive from another demo or a robot on this machine.
     domain = os.environ.get("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     with Processes(out, {"ROS_DOMAIN_ID": domain}) as processes:
-        processes.start("record", [executable("knee_gap_replay", "record"), str(recording), *RECORDED])
+        processes.start(
+            "record", [executable("knee_gap_replay", "record"), str(recording), *RECORDED, "--force"]
+        )
         for node, package in NODES.items():
             command = [executable(package, node), "--ros-args", "-r", f"__ns:={NAMESPACE}"]
             if rate != 1.0:
@@ -93,7 +95,6 @@ def run(bag: Path, out: Path, rate: float) -> None:
     if not (bag / PARAMETERS_FILE).is_file():
         raise BagError(f"{bag} has no {PARAMETERS_FILE} with the pose of the lens on the tracked body")
     out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / RECORDING, ignore_errors=True)
     recording = play_through_nodes(bag, out, begin, rate)
     comparison = compare(bag, recording)
     write_gap_plot(comparison, out / "gap.png", f"knee_gap, live: {bag.name}")

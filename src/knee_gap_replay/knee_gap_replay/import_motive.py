@@ -20,6 +20,7 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.trackers.motive_csv import Take, TakeBody, read_take
 from knee_gap_perception.trackers.up_axis import UP_AXES
 from knee_gap_replay.topics import namespace_from
+from knee_gap_replay.whole_bags.output import add_force_argument
 
 # ROS stamps count seconds in 31 bits.
 _END_OF_STAMPS = 1 << 31
@@ -97,7 +98,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise BagError(f"{arguments.take}: the body '{arguments.body}' is not tracked in any frame")
     start_ns = _start_ns(take, arguments)
     metadata = {"take": Path(arguments.take).name, "take_format": take.version, "take_start": take.start_text}
-    with BagWriter(arguments.out, metadata=metadata) as writer:
+    with BagWriter(arguments.out, metadata=metadata, replace=arguments.force) as writer:
         counts = write_take(take, bodies, writer, start_ns)
     frames = len(take.time)
     if take.exported_count not in (None, frames):
@@ -116,7 +117,8 @@ def _parser() -> Parser:
     parser = Parser(prog="import_motive", description=__doc__)
     parser.add_argument("take", metavar="TAKE.csv", help="CSV export of Motive, format 1.20 to 1.25")
     parser.add_argument("body", metavar="BODY", help="name or id of the scope's rigid body")
-    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument("out", metavar="OUT", help="the bag to write")
+    add_force_argument(parser)
     parser.add_argument(
         "--reference", metavar="BODY", help="rigid body of the leg, written to NAMESPACE/reference_body/pose"
     )

@@ -14,6 +14,7 @@ from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
+from knee_gap_replay.whole_bags.output import add_force_argument, refuse_input_as_output
 
 # Files that a bag folder may contain: the calibration of its scope, or parameters for its scope.
 _CALIBRATION, _BESIDE = "calibration.yaml", "scope.yaml"
@@ -40,7 +41,8 @@ def _run(arguments: argparse.Namespace) -> int:
             parameters, topics, namespace_from(arguments), with_mask=arguments.gap_mask
         )
         reader.messages(pipeline.inputs)  # raises for a bag without them before anything is written
-        with BagWriter(arguments.out, metadata=reader.metadata) as writer:
+        refuse_input_as_output(arguments.bag, arguments.out)
+        with BagWriter(arguments.out, metadata=reader.metadata, replace=arguments.force) as writer:
             counts = process(reader, writer, pipeline)
     for flaw in pipeline.flaws():
         print(f"process: {flaw}")
@@ -52,7 +54,8 @@ def _run(arguments: argparse.Namespace) -> int:
 def _parser() -> Parser:
     parser = Parser(prog="process", description=__doc__)
     parser.add_argument("bag", metavar="IN", help="bag folder or .mcap file")
-    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument("out", metavar="OUT", help="the bag to write")
+    add_force_argument(parser)
     parser.add_argument(
         "--params-file",
         metavar="YAML",

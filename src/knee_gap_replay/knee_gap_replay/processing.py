@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 from knee_gap_core.bag.bag import BagMessage, BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.qos import QosName
+from knee_gap_core.bag.writing.bag_writer import SPAN_NS
 from knee_gap_core.node.command_line import with_progress
 
 _LOG = logging.getLogger(__name__)
@@ -113,6 +114,30 @@ def _shifts(reader: BagReader, topics: Sequence[str]) -> dict[str, int]:
     return {topic: shift for topic, shift in shifts.items() if abs(shift) > _OTHER_CLOCK_NS}
 
 
+class LogClock:
+    """Times at which results are logged: their stamps, on a clock that never runs backwards.
+
+    If the stamps of the input run backwards (a recorded loop), the clock runs on where it was. A result with
+    a stamp of another clock is logged at the present time.
+    """
+
+    def __init__(self) -> None:
+        self._stamp_ns: int | None = None
+        self._shift_ns = self._now_ns = 0
+
+    def advance(self, stamp_ns: int) -> None:
+        """Note the stamp of a message that is fed."""
+        if self._stamp_ns is not None and stamp_ns < self._stamp_ns - MOST_LATENCY_NS:
+            self._shift_ns += self._stamp_ns - stamp_ns
+        self._stamp_ns = stamp_ns
+        self._now_ns = max(self._now_ns, stamp_ns + self._shift_ns)
+
+    def log_ns(self, stamp_ns: int) -> int:
+        """Return the log time [ns] of a result with a stamp."""
+        time_ns = stamp_ns + self._shift_ns
+        return time_ns if self._now_ns - SPAN_NS <= time_ns <= self._now_ns else self._now_ns
+
+
 def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[str, int]:
     """Process a bag with a pipeline and write the results; return the number of messages by topic.
 
@@ -124,18 +149,20 @@ def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[st
         raise BagError(f"{reader.path} has no topic {', '.join(missing)}; it has {names}")
     for topic, (msgtype, qos) in pipeline.outputs.items():
         writer.add_topic(topic, msgtype, qos)
+    clock = LogClock()
     for stamped in with_progress(by_stamp(reader, pipeline.inputs), reader.count(pipeline.inputs)):
+        clock.advance(stamped.stamp_ns)
         try:
             message = reader.deserialize(stamped.message)
         except BagError as error:
             _LOG.warning(str(error))
             continue
-        _write(writer, pipeline.feed(stamped.message.topic, message, stamped.stamp_ns))
-    _write(writer, pipeline.finish())
+        _write(writer, clock, pipeline.feed(stamped.message.topic, message, stamped.stamp_ns))
+    _write(writer, clock, pipeline.finish())
     return writer.counts
 
 
-def _write(writer: BagWriter, outputs: Iterable[Output]) -> None:
+def _write(writer: BagWriter, clock: LogClock, outputs: Iterable[Output]) -> None:
     for topic, message, stamp_ns in outputs:
         # Not the present time, so that the same bag gives the same bytes.
-        writer.write(topic, message, stamp_ns)
+        writer.write(topic, message, clock.log_ns(stamp_ns))

@@ -28,6 +28,7 @@ from knee_gap_core.node.base_node import GuardedNode
 from knee_gap_core.node.command_line import Parser, positive, run, stop_on_signals
 from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay.recording import WriterThread
+from knee_gap_replay.whole_bags.output import add_force_argument
 
 _LOG = logging.getLogger(__name__)
 # One second of a tracker at 240 Hz, four of images: how long the recorder may be stalled on a busy machine.
@@ -135,7 +136,7 @@ def _offered(publisher: TopicEndpointInfo) -> Qos:
 
 def _run(arguments: argparse.Namespace) -> int:
     stop = stop_on_signals()
-    bag = BagWriter(arguments.out)
+    bag = BagWriter(arguments.out, replace=arguments.force)
     writer = WriterThread(bag)
     node = RecordNode(arguments.topics, writer)
     with bag:
@@ -169,7 +170,8 @@ def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) ->
 
 def _parser() -> Parser:
     parser = Parser(prog="record", description=__doc__)
-    parser.add_argument("out", metavar="OUT", help="the bag to write; must not exist")
+    parser.add_argument("out", metavar="OUT", help="the bag to write")
+    add_force_argument(parser)
     parser.add_argument(
         "topics", nargs="+", metavar="TOPIC", help="topics to record, once they are published"
     )

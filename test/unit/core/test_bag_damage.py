@@ -32,7 +32,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[BagMess
             if index % 8 == 7:
                 bag.flush()
     with BagReader(path) as reader:
-        return (path / "bag.mcap").read_bytes(), list(reader.messages())
+        return (path / "bag_0.mcap").read_bytes(), list(reader.messages())
 
 
 def read(path: Path, content: bytes) -> tuple[list[BagMessage], tuple[str, ...]]:
@@ -158,7 +158,7 @@ def test_damaged_metadata_does_not_hide_the_messages(
     whole: tuple[bytes, list[BagMessage]], tmp_path: Path
 ) -> None:
     content, original = whole
-    (tmp_path / "bag.mcap").write_bytes(content)
+    (tmp_path / "bag_0.mcap").write_bytes(content)
     (tmp_path / "metadata.yaml").write_text("{ not yaml")
     with BagReader(tmp_path) as reader:
         assert list(reader.messages()) == original

@@ -64,13 +64,13 @@ def test_our_reader_gives_back_messages_types_and_metadata(bag: Path) -> None:
 
 
 def test_a_bare_file_serves_as_well_as_its_folder(bag: Path) -> None:
-    with BagReader(bag) as folder, BagReader(bag / "bag.mcap") as file:
+    with BagReader(bag) as folder, BagReader(bag / "bag_0.mcap") as file:
         assert list(folder.messages()) == list(file.messages())
         assert file.metadata == folder.metadata
 
 
 def test_the_mcap_reader_decodes_every_message(bag: Path) -> None:
-    with (bag / "bag.mcap").open("rb") as file:
+    with (bag / "bag_0.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         decoded = [(channel.topic, m) for _, channel, _, m in reader.iter_decoded_messages()]
         assert reader.get_header().profile == "ros2"
@@ -97,7 +97,7 @@ def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         write(tmp_path / folder / "bag")
     same, different, odd = filecmp.cmpfiles(
-        tmp_path / "a" / "bag", tmp_path / "b" / "bag", ["bag.mcap", "metadata.yaml"], shallow=False
+        tmp_path / "a" / "bag", tmp_path / "b" / "bag", ["bag_0.mcap", "metadata.yaml"], shallow=False
     )
     assert (len(same), different, odd) == (2, [], [])
 
@@ -140,7 +140,7 @@ def test_mistakes_are_refused_by_name(tmp_path: Path, bag: Path) -> None:
 
 def test_an_old_definition_in_a_bag_is_read_as_the_bag_has_it(bag: Path) -> None:
     """The type's name alone does not say how its bytes are laid out."""
-    content = (bag / "bag.mcap").read_bytes()
+    content = (bag / "bag_0.mcap").read_bytes()
     # In every copy of the schema the pose's two parts change places, as an older version might have had them.
     swapped = content.replace(
         b"geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",

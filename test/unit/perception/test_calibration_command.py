@@ -212,9 +212,9 @@ def test_a_bag_without_metadata_is_read_as_by_check_and_process(
 ) -> None:
     folder = tmp_path / "bare"
     folder.mkdir()
-    shutil.copy(step_bags[0] / "board.mcap", folder / "board.mcap")
+    shutil.copy(step_bags[0] / "board_0.mcap", folder / "board.mcap")
     hashes = []
-    for number, place in enumerate((step_bags[0], folder, folder / "board.mcap")):
+    for number, place in enumerate((step_bags[0], folder, folder / "board_0.mcap")):
         out = tmp_path / f"{number}.yaml"
         code, _, errors = run(capsys, "intrinsics", place, "--into", out, "--board", BOARD, "--views", 8)
         assert (code, errors) == (0, [])
@@ -225,7 +225,7 @@ def test_a_bag_without_metadata_is_read_as_by_check_and_process(
 def test_a_cut_bag_is_calibrated_by_what_is_left_or_refused_in_one_line(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    content = (bag / "bag.mcap").read_bytes()
+    content = (bag / "bag_0.mcap").read_bytes()
     ends = []
     for share in (0.0005, 0.02, 0.3, 0.7):
         cut = tmp_path / f"cut_{share}.mcap"

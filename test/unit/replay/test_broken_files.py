@@ -172,14 +172,14 @@ def read_all(path: Path) -> tuple[int, str]:
 
 
 def test_a_broken_bag_is_checked(fresh_bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = fresh_bag / "bag.mcap"
+    file = fresh_bag / "bag_0.mcap"
     files = damaged(file.read_bytes(), 11)
     found = codes(files, file, lambda _: check.main([str(fresh_bag)]), capsys)
     assert set(found) == {0, 1}
 
 
 def test_a_broken_bag_is_processed(fresh_bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, out = fresh_bag / "bag.mcap", fresh_bag.parent / "out"
+    file, out = fresh_bag / "bag_0.mcap", fresh_bag.parent / "out"
 
     def run(_: Path) -> int:
         shutil.rmtree(out, ignore_errors=True)
@@ -192,7 +192,7 @@ def test_a_broken_bag_is_processed(fresh_bag: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_broken_bag_is_calibrated_and_judged(fresh_bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file, into = fresh_bag / "bag.mcap", fresh_bag.parent / "into.yaml"
+    file, into = fresh_bag / "bag_0.mcap", fresh_bag.parent / "into.yaml"
     for step in ("pivot", "time_offset"):
         codes(
             damaged(file.read_bytes(), 13),

@@ -106,7 +106,7 @@ def test_check_tells_why_a_bag_cannot_be_used(
 def test_check_tells_damage_and_judges_by_what_is_left(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = (write(tmp_path / "bag") / "bag.mcap").read_bytes()
+    content = (write(tmp_path / "bag") / "bag_0.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
     assert check.main([str(tmp_path / "cut.mcap")]) == 1
     assert "1 damaged or missing parts" in capsys.readouterr().out

@@ -142,7 +142,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
         make_bag(tmp_path / name / "bag", recording, progress=False)
     other = Recording(duration_s=0.1, seed=14)
     make_bag(tmp_path / "c" / "bag", other, progress=False)
-    a, b, c = ((tmp_path / name / "bag" / "bag.mcap").read_bytes() for name in "abc")
+    a, b, c = ((tmp_path / name / "bag" / "bag_0.mcap").read_bytes() for name in "abc")
     assert a == b
     assert a != c
 

@@ -1,4 +1,4 @@
-"""Bags of ROS 2, written and read without ROS.
+"""Bags of ROS 2, read without ROS.
 
 A bag is a folder with `metadata.yaml` and MCAP files, as `ros2 bag` and Foxglove open it; a bare `.mcap` is
 read too. Times are integer nanoseconds.
@@ -6,14 +6,12 @@ read too. Times are integer nanoseconds.
 
 import os
 import struct
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-from rosbags.interfaces import Connection, Nodetype, Qos
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.interfaces import Nodetype, Qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -22,13 +20,11 @@ from knee_gap_core.bag.bag_paths import missing_bag
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.former_names import topic_today, type_today
 from knee_gap_core.bag.mcap_file import McapFile, in_time_order, mcap_files
-from knee_gap_core.bag.mcap_storage import METADATA_RECORD, ChecksummedMcap
 from knee_gap_core.bag.message_types import full_name, known_type, typestore
-from knee_gap_core.bag.qos import PROFILES, QosName
-from knee_gap_core.user_files import FileError, flaw_of_new, read_yaml, reason_of
+from knee_gap_core.bag.writing.bag_writer import BagWriter as BagWriter
+from knee_gap_core.bag.writing.mcap_storage import METADATA_RECORD
+from knee_gap_core.user_files import FileError, read_yaml
 
-# DDS pads what it sends; a bag written here and played and recorded again then has the same bytes.
-_DDS_ALIGNMENT = 4
 _CONVERT = "convert it first: rosbags-convert --src IN --dst OUT --dst-storage mcap"
 _STAMP_END = 12
 _HEADER_FIELD = ("header", (Nodetype.NAME, "std_msgs/msg/Header"))
@@ -51,100 +47,6 @@ class Topic(NamedTuple):
     encoding: str
     definition: str
     type_hash: str
-
-
-class _RosbagWriter(Writer):
-    STORAGE_PLUGINS: Mapping[StoragePlugin, Any] = {
-        **Writer.STORAGE_PLUGINS,
-        StoragePlugin.MCAP: ChecksummedMcap,
-    }
-
-
-class BagWriter:
-    """Writes a new bag; a context manager.
-
-    The same calls give the same bytes. What was written before an exception is kept and readable. Raises
-    BagError where `path` exists already or cannot be made.
-    """
-
-    def __init__(self, path: str | PathLike[str], *, metadata: Mapping[str, str] | None = None) -> None:
-        self.path = Path(path)
-        self._metadata = dict(metadata or {})
-        self._topics: dict[str, Connection] = {}
-        if flaw := flaw_of_new(self.path):
-            raise BagError(flaw)
-        self._writer = _RosbagWriter(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
-
-    def __enter__(self) -> Self:
-        try:
-            self._writer.open()
-        except (OSError, WriterError) as error:
-            raise BagError(f"{self.path} cannot be made: {reason_of(error)}") from None
-        for key, value in self._metadata.items():
-            self._writer.set_custom_data(key, value)
-        if self._metadata:
-            self._storage.add_metadata(self._metadata)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            self._writer.close()
-        except OSError as failure:
-            raise BagError(f"{self.path} cannot be finished: {failure.strerror}") from failure
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Messages written so far, by topic."""
-        return {topic: self._writer.counts[connection.id] for topic, connection in self._topics.items()}
-
-    def add_topic(self, name: str, msgtype: str, qos: QosName | Sequence[Qos] = "reliable") -> None:
-        """Announce a topic; again with the same type is allowed.
-
-        `qos` is what its publisher offers: `sensor` (best effort), `reliable`, `latched` (kept for late
-        subscribers), or the profiles themselves. Raises BagError for an unknown type or quality of service.
-        """
-        msgtype = known_type(msgtype)
-        if (known := self._topics.get(name)) is not None:
-            if known.msgtype != msgtype:
-                raise BagError(f"topic {name} has type {known.msgtype}, not {msgtype}")
-            return
-        if isinstance(qos, str):
-            if qos not in PROFILES:
-                raise BagError(f"quality of service '{qos}' is unknown; valid are {', '.join(PROFILES)}")
-            qos = [PROFILES[qos]]
-        self._topics[name] = self._writer.add_connection(
-            name, msgtype, typestore=typestore(), offered_qos_profiles=qos
-        )
-
-    def write(self, topic: str, message: object, time_ns: int) -> None:
-        """Serialise a message of `knee_gap_core.bag.message_types` and write it with its time [ns]."""
-        connection = self._connection(topic)
-        data = bytes(typestore().serialize_cdr(message, connection.msgtype))
-        padding = bytes(-len(data) % _DDS_ALIGNMENT)
-        self._writer.write(connection, time_ns, data + padding)
-
-    def write_raw(self, topic: str, cdr_bytes: bytes | memoryview, time_ns: int) -> None:
-        """Write a serialised message with its time [ns]."""
-        self._writer.write(self._connection(topic), time_ns, cdr_bytes)
-
-    def flush(self) -> None:
-        """Hand everything so far to the operating system: it then survives the end of this process."""
-        self._storage.flush()
-
-    @property
-    def _storage(self) -> ChecksummedMcap:
-        storage = self._writer.storage
-        assert isinstance(storage, ChecksummedMcap)
-        return storage
-
-    def _connection(self, topic: str) -> Connection:
-        try:
-            return self._topics[topic]
-        except KeyError:
-            names = ", ".join(self._topics) or "none"
-            raise BagError(f"topic {topic} was not added to {self.path}; added are {names}") from None
 
 
 class BagReader:

@@ -3,3 +3,7 @@
 
 class BagError(ValueError):
     """A bag, topic, type or command that cannot be used; the message is one line and says why."""
+
+
+class DiskFullError(BagError):
+    """The disk is full; what could not be written waits in memory."""

@@ -1,0 +1,1 @@
+"""Commands on whole bags: what may be replaced, recovery, many bags at once."""
