@@ -226,7 +226,7 @@ def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcom
     topics = InputTopics(IMAGE, CAMERA_INFO, BODY_POSE)
     pipeline = GapPipeline.from_parameters(file, topics, SPACE)
     recorder = Recorder(file.build("uncertainty_node", [EstimatorParameters])[0])
-    pipeline._estimator = recorder  # type: ignore[assignment]
+    pipeline.estimation.estimator = recorder  # type: ignore[assignment]
     edges: dict[int, SeenEdges] = {}
     for topic, message, stamp in recording.with_fault(fault):
         _note_edges(pipeline.feed(topic, message, stamp), edges)

@@ -3,7 +3,6 @@
 The cores exchange messages, as the nodes do.
 """
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Self
@@ -17,9 +16,8 @@ from knee_gap_core.bag.qos import QosName
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.values.edges import GapEdges
-from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_core.values.stamps import NANOSECONDS, set_stamp
+from knee_gap_core.values.stamps import set_stamp
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
@@ -42,15 +40,11 @@ from knee_gap_perception.trackers.natnet.client import NatNetParameters
 from knee_gap_perception.trackers.pose_topic import PoseTopics
 from knee_gap_perception.trackers.scope_feed import SCOPE, SourceParameters
 from knee_gap_replay.processing import Output
+from knee_gap_replay.stages.estimation import EstimationStage, Request, log_fault
 from knee_gap_replay.topics import InputTopics
-from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
-
-_LOG = logging.getLogger(__name__)
-_NUMBERS = {"gap/min": "gap_min", "gap/max": "gap_max", "gap/snr": "snr"}
-
 
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
@@ -135,7 +129,7 @@ class GapPipeline:
         for name, topic in tracker.parameters.other_bodies.items():
             self._body_names[f"{space}/{topic}"] = name
         self._bodies = PoseTopics([*self._body_names.values()], up_axis=up_axis)
-        self._estimator = estimator
+        self.estimation = EstimationStage(estimator, space)
         self._topics = topics
         self._space = space
         self._with_mask = with_mask
@@ -153,7 +147,7 @@ class GapPipeline:
             if any(used.values())
         ]
         # As in the nodes: an exception rejects one message, and that core starts again.
-        self._seam = Seam(self._log_fault)
+        self._seam = Seam(log_fault)
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still while they run backwards.
         self._now_ns = 0
@@ -164,10 +158,7 @@ class GapPipeline:
         self.outputs: Mapping[str, tuple[str, QosName]] = {
             self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
             self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
-            self._topic("gap"): ("knee_gap_msgs/msg/GapEstimate", "reliable"),
-            self._topic("gap_profile"): ("knee_gap_msgs/msg/GapProfile", "reliable"),
-            self._topic("motion_advice"): ("knee_gap_msgs/msg/MotionAdvice", "reliable"),
-            **{self._topic(name): ("std_msgs/msg/Float64", "reliable") for name in _NUMBERS},
+            **self.estimation.outputs,
         }
         if self._calibrations:
             self.outputs = {
@@ -189,6 +180,28 @@ class GapPipeline:
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
         """Process an image, a camera model or a pose of the tracked body; return the messages published."""
+        return self._both(self.observe(topic, message, stamp_ns))
+
+    def finish(self) -> Iterable[Output]:
+        """Return the edges and estimates of images that are still waiting for their lens pose."""
+        return self._both(self.observe_end())
+
+    def estimate(self, request: Request) -> Iterator[Output]:
+        """The second stage: answer a request of the first."""
+        return self.estimation.answer(request)
+
+    def _both(self, observed: Iterable[Output | Request]) -> Iterator[Output]:
+        for item in observed:
+            if isinstance(item, Output):
+                yield item
+            else:
+                yield from self.estimate(item)
+
+    def observe(self, topic: str, message: Any, stamp_ns: int) -> Iterator[Output | Request]:
+        """The first stage: segmentation and tracking. Its requests are for `estimate`, in this order.
+
+        It needs no answer, so that the second stage may run later or elsewhere.
+        """
         if self._newest_stamp_ns is not None:
             self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
         else:
@@ -196,13 +209,12 @@ class GapPipeline:
         self._newest_stamp_ns = stamp_ns
         # Before the message is processed: images whose wait is over go on without it, as live.
         yield from self._looked_at(self._detector.ready(self._now_ns))
-        yield from self._estimated("time", lambda: self._estimator.advance(self._now_ns))
-        yield from self._advice()
+        yield self._request("time", "time")
         what = f"message on {topic}"
         if topic == self._topics.camera_info:
             yield from self._segmented(what, lambda: self._detector.on_camera_info(message))
         elif topic in self._leg_body:
-            yield from self._estimated(what, lambda: self._on_leg_pose(message))
+            yield self._request("leg_pose", what, message)
         elif topic in self._body_names:
             name = self._body_names[topic]
             yield from self._on_lenses(
@@ -214,23 +226,36 @@ class GapPipeline:
 
     def flaws(self) -> list[str]:
         """Faults, one line each: those of the calibration that make all results invalid, and exceptions."""
-        size = self._detector.size_flaw
-        faults = [f"{count} times {fault}" for fault, count in self._seam.counts.items()]
-        return [flaw for flaw in (self._estimator.calibration_flaw, size, *faults) if flaw]
+        return [*self.estimation_flaws(), *self.observation_flaws()]
 
-    def finish(self) -> Iterable[Output]:
-        """Return the edges and estimates of images that are still waiting for their lens pose."""
+    def observation_flaws(self) -> list[str]:
+        """Faults of the first stage."""
+        size = self._detector.size_flaw
+        return [*([size] if size else []), *_counted(self._seam)]
+
+    def estimation_flaws(self) -> list[str]:
+        """Faults of the second stage."""
+        flaw = self.estimation.estimator.calibration_flaw
+        return [*([flaw] if flaw else []), *_counted(self.estimation.seam)]
+
+    def unread(self) -> str:
+        """Why no image could be read; empty if one was."""
+        if self._detector.images_read:
+            return ""
+        return self._detector.unread_reason or "there is none"
+
+    def observe_end(self) -> Iterator[Output | Request]:
+        """The first stage of the images that are still waiting for their lens pose."""
         faults = -1
         while faults < self._seam.counts.total():
             # Repeated if an image raised, for the images after it.
             faults = self._seam.counts.total()
             yield from self._looked_at(self._detector.finish())
-        wait_ns = round(self._estimator.parameters.max_pose_wait * NANOSECONDS)
-        yield from self._estimated("end", lambda: self._estimator.advance(self._now_ns + wait_ns + 1))
+        yield self._request("end", "end")
 
-    def _reported_calibrations(self, stamp_ns: int) -> Iterator[Output]:
+    def _reported_calibrations(self, stamp_ns: int) -> Iterator[Output | Request]:
         for reported in self._calibrations:
-            self._estimator.add_calibration(messages.calibration_from_message(reported))
+            yield self._request("calibration", "scope_calibration", reported)
             yield Output(self._topic("scope_calibration"), reported, stamp_ns)
 
     def _tracked(self, name: str, message: Any) -> list[LensPose | Refusal]:
@@ -242,11 +267,7 @@ class GapPipeline:
                 lenses += self._tracker.take(body, others)
         return lenses
 
-    def _on_leg_pose(self, message: Any) -> list[GapEstimate]:
-        self._estimator.add_leg_pose(messages.leg_pose_from_message(message))
-        return []
-
-    def _on_image(self, what: str, message: Any) -> Iterator[Output]:
+    def _on_image(self, what: str, message: Any) -> Iterator[Output | Request]:
         observations: list[NotchObservation] = []
 
         def look() -> None:
@@ -257,7 +278,7 @@ class GapPipeline:
         for observation in observations:
             yield from self._on_notch(observation, str(message.header.frame_id))
 
-    def _on_notch(self, observation: NotchObservation, frame_id: str) -> Iterator[Output]:
+    def _on_notch(self, observation: NotchObservation, frame_id: str) -> Iterator[Output | Request]:
         reported = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), observation, frame_id)
         yield Output(self._topic("scope_notch"), reported, observation.stamp_ns)
         observation = notch_from_message(reported)
@@ -265,34 +286,23 @@ class GapPipeline:
             self._seam.call("notch", self._restart_tracker, lambda: self._tracker.take_notch(observation))
         )
 
-    def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output]:
+    def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output | Request]:
         for lens in lenses:
             if not isinstance(lens, LensPose):
                 continue
             if self._tracker.follows_rotation:
                 turn = fill_scope_rotation(blank("knee_gap_msgs/msg/ScopeRotation"), lens)
                 yield Output(self._topic("scope_rotation"), turn, lens.stamp_ns)
-                yield from self._estimated("scope_rotation", partial(self._on_turn, turn))
+                yield self._request("rotation", "scope_rotation", turn)
             pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
             yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
-            yield from self._estimated("scope_pose", partial(self._on_pose, pose))
+            yield self._request("pose", "scope_pose", pose)
             yield from self._segmented("scope_pose", partial(self._detector.on_lens_pose, pose))
 
-    def _on_turn(self, turn: Any) -> list[GapEstimate]:
-        return self._estimator.add_rotation(messages.rotation_from_message(turn), self._now_ns)
+    def _request(self, kind: str, what: str, message: Any = None) -> Request:
+        return Request(kind, what, message, self._now_ns)
 
-    def _on_pose(self, pose: Any) -> list[GapEstimate]:
-        return self._estimator.add_pose(messages.pose_from_message(pose), self._now_ns)
-
-    def _on_edges(self, edges: Any) -> list[GapEstimate]:
-        return self._estimator.add_edges(messages.edges_from_message(edges), self._now_ns)
-
-    def _estimated(self, what: str, call: Callable[[], list[GapEstimate]]) -> Iterator[Output]:
-        """Return the estimator's messages."""
-        answer = self._seam.call(what, lambda fault: self._estimator.recover(fault.reason), call)
-        return self._published(answer)
-
-    def _segmented(self, what: str, call: Callable[[], None]) -> Iterator[Output]:
+    def _segmented(self, what: str, call: Callable[[], None]) -> Iterator[Output | Request]:
         """Pass an input to the edge stream; return the messages published because of an exception, if any."""
 
         def nothing() -> list[GapEdges]:
@@ -308,11 +318,7 @@ class GapPipeline:
         self._tracker.reset()
         return []
 
-    @staticmethod
-    def _log_fault(fault: Fault) -> None:
-        _LOG.debug(fault.traceback)
-
-    def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output]:
+    def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output | Request]:
         for edges in self._seam.each("image", self._restart_detector, images):
             edges_message = fill_gap_edges(
                 blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
@@ -320,32 +326,14 @@ class GapPipeline:
             yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
             if self._with_mask and (mask := self._detector.mask()) is not None:
                 yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)
-            yield from self._estimated("gap_edges", partial(self._on_edges, edges_message))
-
-    def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
-        for estimate in estimates:
-            gap = messages.fill_gap_estimate(blank("knee_gap_msgs/msg/GapEstimate"), estimate)
-            yield Output(self._topic("gap"), gap, estimate.stamp_ns)
-            if estimate.status is GapStatus.VALID:
-                for name, attribute in _NUMBERS.items():
-                    number = blank("std_msgs/msg/Float64")
-                    number.data = float(getattr(estimate, attribute))
-                    yield Output(self._topic(name), number, estimate.stamp_ns)
-
-        while self._estimator.profiles:
-            profile = self._estimator.profiles.popleft()
-            message = messages.fill_gap_profile(blank("knee_gap_msgs/msg/GapProfile"), profile)
-            yield Output(self._topic("gap_profile"), message, profile.stamp_ns)
-
-    def _advice(self) -> Iterator[Output]:
-        while self._estimator.advice:
-            advice = self._estimator.advice.popleft()
-            message = blank("knee_gap_msgs/msg/MotionAdvice")
-            messages.fill_motion_advice(message, advice, self._estimator.advice_parameters)
-            yield Output(self._topic("motion_advice"), message, advice.stamp_ns)
+            yield self._request("edges", "gap_edges", edges_message)
 
     def _topic(self, name: str) -> str:
         return f"{self._space}/{name}"
+
+
+def _counted(seam: Seam) -> list[str]:
+    return [f"{count} times {fault}" for fault, count in seam.counts.items()]
 
 
 def _mask_message(edges: GapEdges, mask: npt.NDArray[np.uint8]) -> Any:

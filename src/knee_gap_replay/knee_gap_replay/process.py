@@ -1,66 +1,89 @@
-"""The command `process`: a bag of results from a bag of inputs, by the cores of the live nodes, without ROS.
+"""The command `process`: bags of results from bags of inputs, by the cores of the live nodes, without ROS.
 
-Messages are processed in the order of their stamps, none is dropped, and the same bag gives the same bytes.
+Messages are processed in the order of their stamps, none is dropped, and the same bag gives the same bytes,
+whatever the number of workers.
 """
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.node.command_line import Parser, run
-from knee_gap_core.node.parameters_file import ParametersFile
-from knee_gap_replay.pipeline import GapPipeline
-from knee_gap_replay.processing import process
-from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
-from knee_gap_replay.whole_bags.output import add_force_argument, refuse_input_as_output
-
-# Files that a bag folder may contain: the calibration of its scope, or parameters for its scope.
-_CALIBRATION, _BESIDE = "calibration.yaml", "scope.yaml"
-
-
-def _parameters(arguments: argparse.Namespace) -> ParametersFile:
-    """Parameters from the named file, else from the files in the bag folder."""
-    if arguments.params_file is not None:
-        return ParametersFile(Path(arguments.params_file))
-    bag = Path(arguments.bag)
-    folder = bag if bag.is_dir() else bag.parent
-    if (folder / _CALIBRATION).is_file():
-        return ParametersFile.with_calibration(folder / _CALIBRATION)
-    return ParametersFile(folder / _BESIDE if (folder / _BESIDE).is_file() else None)
+from knee_gap_replay.topics import add_topic_arguments, namespace_from
+from knee_gap_replay.whole_bags.output import add_force_argument
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    with BagReader(arguments.bag) as reader:
-        if reader.renamed:
-            print(f"process: {reader.renamed}", flush=True)
-        parameters = _parameters(arguments)
-        topics = topics_from(arguments, reader.topics)
-        pipeline = GapPipeline.from_parameters(
-            parameters, topics, namespace_from(arguments), with_mask=arguments.gap_mask
+    # Only here, so that --help and a mistake of the command line are answered at once.
+    from knee_gap_replay.whole_bags.many_bags import process_many
+    from knee_gap_replay.whole_bags.one_bag import Job, process_one
+
+    def job(bag: str, out: str, *, replace: bool) -> Job:
+        return Job(
+            bag=bag,
+            out=out,
+            replace=replace,
+            params_file=arguments.params_file,
+            namespace=namespace_from(arguments),
+            topics=(arguments.image, arguments.camera_info, arguments.pose),
+            with_mask=arguments.gap_mask,
         )
-        reader.messages(pipeline.inputs)  # raises for a bag without them before anything is written
-        refuse_input_as_output(arguments.bag, arguments.out)
-        with BagWriter(arguments.out, metadata=reader.metadata, replace=arguments.force) as writer:
-            counts = process(reader, writer, pipeline)
-    for flaw in pipeline.flaws():
-        print(f"process: {flaw}")
-    summary = ", ".join(f"{count} {topic}" for topic, count in counts.items())
-    print(f"process: {summary} in {arguments.out}")
-    return 0
+
+    *bags, out = arguments.bags
+    if len(bags) > 1 or arguments.into:
+        return process_many(bags, Path(out), job, arguments.workers, force=arguments.force)
+    result = process_one(job(bags[0], out, replace=arguments.force), arguments.workers)
+    for line in result.lines:
+        print(f"process: {line}", flush=True)
+    return result.exit_code
+
+
+def _workers(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 256:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 256, not '{text}'")
+    return int(text)
+
+
+class _BagsAndOut(argparse.Action):
+    """At least one bag, and what is to be written."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, _: Any = None) -> None:
+        if len(values) < 2:
+            parser.error("the following arguments are required: OUT")
+        setattr(namespace, self.dest, values)
 
 
 def _parser() -> Parser:
-    parser = Parser(prog="process", description=__doc__)
-    parser.add_argument("bag", metavar="IN", help="bag folder or .mcap file")
-    parser.add_argument("out", metavar="OUT", help="the bag to write")
+    parser = Parser(
+        prog="process",
+        description=__doc__,
+        usage="process [options] BAG OUT\n       process [options] BAG BAG... FOLDER",
+    )
+    parser.add_argument(
+        "bags",
+        nargs="+",
+        action=_BagsAndOut,
+        metavar="BAG",
+        help="bag folders or .mcap files, and last the bag to write; of several bags the folder for their "
+        "results, one bag each, and for summary.csv. Run again, it goes on where it was stopped",
+    )
     add_force_argument(parser)
+    parser.add_argument(
+        "--into", action="store_true", help="take the last argument as a folder of results for one bag too"
+    )
+    parser.add_argument(
+        "--workers",
+        type=_workers,
+        metavar="N",
+        help="processes at once (as many as there are cores): bags, or the two stages of one bag",
+    )
     parser.add_argument(
         "--params-file",
         metavar="YAML",
-        help=f"ROS parameters of the nodes; default: {_CALIBRATION} in the bag as calibration_file, or else "
-        f"its {_BESIDE}",
+        help="ROS parameters of the nodes; default: calibration.yaml in the bag as calibration_file, or else "
+        "its scope.yaml",
     )
     parser.add_argument(
         "--gap-mask", action="store_true", help="write the gap mask of every image as well (gap_mask)"
@@ -70,7 +93,7 @@ def _parser() -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Process a bag."""
+    """Process one bag or many."""
     return run(_parser(), _run, argv)
 
 

@@ -138,28 +138,54 @@ class LogClock:
         return time_ns if self._now_ns - SPAN_NS <= time_ns <= self._now_ns else self._now_ns
 
 
+class Fed(NamedTuple):
+    """A message to feed into a pipeline; `message` is None where it cannot be read."""
+
+    topic: str
+    message: Any
+    stamp_ns: int
+
+
+def fed(reader: BagReader, topics: Sequence[str]) -> Iterator[Fed]:
+    """Yield the messages of `topics` in the order of their stamps; log what cannot be read."""
+    for stamped in by_stamp(reader, topics):
+        message = None
+        try:
+            message = reader.deserialize(stamped.message)
+        except BagError as error:
+            _LOG.warning(str(error))
+        yield Fed(stamped.message.topic, message, stamped.stamp_ns)
+
+
+def announce(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> None:
+    """Announce the results. Raises BagError if the bag lacks a topic that the pipeline needs."""
+    if missing := [topic for topic in pipeline.inputs if topic not in reader.topics]:
+        names = ", ".join(sorted(reader.topics)) or "none"
+        raise BagError(f"{reader.path} has no topic {', '.join(missing)}; it has {names}")
+    for topic, (msgtype, qos) in pipeline.outputs.items():
+        writer.add_topic(topic, msgtype, qos)
+
+
 def process(reader: BagReader, writer: BagWriter, pipeline: Pipeline) -> dict[str, int]:
     """Process a bag with a pipeline and write the results; return the number of messages by topic.
 
     A message that cannot be read is reported in one line and skipped. Raises BagError if the bag lacks a
     topic that the pipeline needs.
     """
-    if missing := [topic for topic in pipeline.inputs if topic not in reader.topics]:
-        names = ", ".join(sorted(reader.topics)) or "none"
-        raise BagError(f"{reader.path} has no topic {', '.join(missing)}; it has {names}")
-    for topic, (msgtype, qos) in pipeline.outputs.items():
-        writer.add_topic(topic, msgtype, qos)
+    announce(reader, writer, pipeline)
     clock = LogClock()
-    for stamped in with_progress(by_stamp(reader, pipeline.inputs), reader.count(pipeline.inputs)):
-        clock.advance(stamped.stamp_ns)
-        try:
-            message = reader.deserialize(stamped.message)
-        except BagError as error:
-            _LOG.warning(str(error))
-            continue
-        _write(writer, clock, pipeline.feed(stamped.message.topic, message, stamped.stamp_ns))
+    messages = fed(reader, pipeline.inputs)
+    for topic, message, stamp_ns in with_progress(messages, reader.count(pipeline.inputs), stamp_of):
+        clock.advance(stamp_ns)
+        if message is not None:
+            _write(writer, clock, pipeline.feed(topic, message, stamp_ns))
     _write(writer, clock, pipeline.finish())
     return writer.counts
+
+
+def stamp_of(item: Fed) -> int:
+    """Return the stamp [ns] by which progress is measured."""
+    return item.stamp_ns
 
 
 def _write(writer: BagWriter, clock: LogClock, outputs: Iterable[Output]) -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from knee_gap_core.values.errors import BaselineTooShortError, MeasurementError
 from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
@@ -327,7 +327,7 @@ class Track:
         gap_min, gap_max = bounds_of_gap(near, far, opening, edges, observation.angular_error)
         if not np.isfinite(fitted.points).all():
             return replace(measured, gap_min=gap_min, gap_max=np.inf, confidence_min=0.0)
-        radius = float(norm.ppf(0.5 + 0.5 * self._parameters.confidence_level))
+        radius = float(ndtri(0.5 + 0.5 * self._parameters.confidence_level))
         found = instrument_gap(fitted, view.lens, opening, edges, radius)
         if observation.sections:
             self.profile = self._profile(observation, view, fitted, (near, far), opening, edges)

@@ -1,5 +1,6 @@
 """process and check as a user meets them: one line for a mistake, and exit codes that a script can use."""
 
+import re
 import signal
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.node import command_line
 from knee_gap_replay import check, process, processing
+from knee_gap_replay.whole_bags import one_bag
 
 IMAGE, INFO, POSE = "/knee_gap/image_raw/compressed", "/knee_gap/camera_info", "/knee_gap/scope_body/pose"
 
@@ -41,12 +43,17 @@ def reported(capsys: pytest.CaptureFixture[str]) -> str:
 SCOPE = "tracking_node:\n  ros__parameters:\n    body_to_shaft_translation: [0.0, 0.0, 0.2]\n"
 
 
-def test_process_of_empty_images_says_so_for_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_process_of_empty_images_says_so_for_each_and_in_the_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
+) -> None:
     out = tmp_path / "out"
     bag = write(tmp_path / "bag")
     (bag / "scope.yaml").write_text(SCOPE)
-    assert process.main([str(bag), str(out)]) == 0
-    assert "50 /knee_gap/gap_edges" in capsys.readouterr().out
+    assert process.main([str(bag), str(out), "--workers", workers]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert "50 /knee_gap/gap_edges" in lines[-2]
+    assert lines[-1] == f"process: no image on {IMAGE} could be read: the compressed image is empty: 0 bytes"
     with BagReader(out) as reader:
         statuses = [reader.deserialize(m).status for m in reader.messages(["/knee_gap/gap"])]
         assert reader.topics["/knee_gap/gap/snr"] == "std_msgs/msg/Float64"
@@ -79,6 +86,28 @@ def test_process_refuses_mistakes_in_one_line(tmp_path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit, match="2"):
         process.main([bag])
     assert "required: OUT" in reported(capsys)
+
+
+def test_process_replaces_its_results_on_demand_and_its_input_never(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, out = write(tmp_path / "bag"), tmp_path / "out"
+    (bag / "scope.yaml").write_text(SCOPE)
+    before = (bag / "bag_0.mcap").read_bytes()
+    one = ["--workers", "1"]
+    assert process.main([str(bag), str(out), *one]) == 1
+    written = (out / "out_0.mcap").read_bytes()
+    capsys.readouterr()
+    assert process.main([str(bag), str(out), *one]) == 1
+    assert "exists already" in reported(capsys)
+    (out / "out_0.mcap").write_bytes(b"")
+    process.main([str(bag), str(out), "--force", *one])
+    assert (out / "out_0.mcap").read_bytes() == written
+    capsys.readouterr()
+    for source in (bag, bag / "bag_0.mcap"):
+        assert process.main([str(source), str(bag), "--force", *one]) == 1
+        assert "is the bag that is read" in reported(capsys)
+    assert (bag / "bag_0.mcap").read_bytes() == before
 
 
 def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,10 +158,10 @@ def test_process_that_is_ended_leaves_a_bag_that_opens(
         begun(reader, writer, pipeline)
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(process, "process", ended_in_the_middle)
+    monkeypatch.setattr(one_bag, "process", ended_in_the_middle)
     before = signal.getsignal(signal.SIGTERM)
     try:
-        assert process.main([str(bag), str(out)]) == 130
+        assert process.main([str(bag), str(out), "--workers", "1"]) == 130
     finally:
         signal.signal(signal.SIGTERM, before)
     assert reported(capsys) == "process: stopped before the end\n"
@@ -145,5 +174,7 @@ def test_long_work_tells_how_far_it_is_off_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command_line, "_SECONDS_BETWEEN_LINES", -1.0)
-    assert list(command_line.with_progress(range(4), 4)) == [0, 1, 2, 3]
-    assert capsys.readouterr().err.splitlines()[1] == "1 messages (25 %)"
+    assert list(command_line.with_progress(range(4), 4, lambda item: item * 10**15)) == [0, 1, 2, 3]
+    lines = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"1 messages \(25 %\), \d+ s left", lines[1])
+    assert re.fullmatch(r"3 messages \(75 %\), [\d.e+]+ times real time, \d+ s left", lines[3])

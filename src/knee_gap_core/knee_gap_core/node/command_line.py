@@ -41,18 +41,73 @@ def run(
         return 130
 
 
-def with_progress(messages: Iterable[Item], total: int | None) -> Iterator[Item]:
-    """Yield the messages: with a bar on a terminal, elsewhere with a line now and then."""
+def with_progress(
+    messages: Iterable[Item], total: int | None, time_ns: Callable[[Item], int] | None = None
+) -> Iterator[Item]:
+    """Yield the messages: with a bar on a terminal, elsewhere with a line now and then.
+
+    `time_ns` is the time of a message in the recording, from which the rate is taken.
+    """
+    pace = _Pace(total)
     if sys.stderr.isatty():
-        yield from tqdm(messages, total=total, unit=" messages", leave=False)
+        with tqdm(messages, total=total, unit=" messages", leave=False) as bar:
+            for message in bar:
+                pace.note(None if time_ns is None else time_ns(message))
+                if pace.is_due(1.0):
+                    bar.set_postfix_str(pace.rate, refresh=False)
+                yield message
         return
-    printed = time.monotonic()
-    for count, message in enumerate(messages):
-        if time.monotonic() - printed > _SECONDS_BETWEEN_LINES:
-            printed = time.monotonic()
-            share = f" ({100 * count // total} %)" if total else ""
-            print(f"{count} messages{share}", file=sys.stderr, flush=True)
+    for message in messages:
+        if pace.is_due(_SECONDS_BETWEEN_LINES):
+            print(pace.line, file=sys.stderr, flush=True)
+        pace.note(None if time_ns is None else time_ns(message))
         yield message
+
+
+class _Pace:
+    """How far a command is, how fast, and how long it will still take."""
+
+    def __init__(self, total: int | None) -> None:
+        self._total = total
+        self._count = self._recorded_ns = 0
+        self._last_ns: int | None = None
+        self._begun = self._told = time.monotonic()
+
+    def note(self, time_ns: int | None) -> None:
+        """Count a message; where the recorded time runs backwards it begins again."""
+        self._count += 1
+        if time_ns is not None:
+            if self._last_ns is not None:
+                self._recorded_ns += max(0, time_ns - self._last_ns)
+            self._last_ns = time_ns
+
+    def is_due(self, seconds: float) -> bool:
+        """Whether so long a time has passed since it was last due."""
+        now = time.monotonic()
+        if now - self._told <= seconds:
+            return False
+        self._told = now
+        return True
+
+    @property
+    def rate(self) -> str:
+        """Recorded time by time passed; empty where it is not known."""
+        passed = time.monotonic() - self._begun
+        if not self._recorded_ns or passed <= 0.0:
+            return ""
+        return f"{self._recorded_ns * 1e-9 / passed:.2g} times real time"
+
+    @property
+    def line(self) -> str:
+        """One line for those who read no bar."""
+        words = [f"{self._count} messages"]
+        if self._total:
+            words[0] += f" ({100 * self._count // self._total} %)"
+        words += [self.rate] if self.rate else []
+        if self._total and self._count:
+            left = (time.monotonic() - self._begun) * (self._total - self._count) / self._count
+            words.append(f"{max(left, 0.0):.0f} s left")
+        return ", ".join(words)
 
 
 def stop_on_signals() -> threading.Event:

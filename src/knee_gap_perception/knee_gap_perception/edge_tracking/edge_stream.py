@@ -5,7 +5,7 @@ and not foretold. It waits for nothing else, and not where no pose is to be expe
 """
 
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import nan
 from typing import Any, NamedTuple
@@ -55,6 +55,13 @@ class _Waiting(NamedTuple):
     expects_pose: bool = True
 
 
+class ReadAhead(NamedTuple):
+    """An image message whose picture is read elsewhere; `image` waits for it and raises what that raised."""
+
+    header: Any
+    image: Callable[[], Image]
+
+
 class EdgeStream:
     """Takes messages by field name; whatever is wrong with one is a status, a reason and a count.
 
@@ -84,6 +91,9 @@ class EdgeStream:
         self.latest: GapEdges | None = None
         self.reason = "no image received yet"
         self.last_refusal = ""
+        # Images whose pictures could be read, and why the last of the others could not.
+        self.images_read = 0
+        self.unread_reason = ""
         self._image: Image | None = None
         self._camera: Camera | None = None
         self._camera_flaw = NO_CAMERA
@@ -171,7 +181,7 @@ class EdgeStream:
         self._unanswered = _Waiting(message, stamp, now_ns)
         image, counted = None, ""
         try:
-            image = _read(message)
+            image = self._read(message)
             self._refuse_other_size(image)
             observation = self._notch.look(stamp, image)
         except PerceptionError as error:
@@ -241,7 +251,7 @@ class EdgeStream:
         stamp, frame_id = waiting.stamp_ns, str(waiting.message.header.frame_id)
         self._image = None
         try:
-            image = _read(waiting.message) if waiting.image is None else waiting.image
+            image = self._read(waiting.message) if waiting.image is None else waiting.image
             self._image = image
             self._refuse_other_size(image)
             if self._camera is None:
@@ -283,6 +293,16 @@ class EdgeStream:
             self.counts[f"tracks ended: {self._poses.break_reason}"] += 1
         self._segment = segment
 
+    def _read(self, message: Any) -> Image:
+        try:
+            refuse_stamp(message.header)
+            image = message.image() if isinstance(message, ReadAhead) else read_image(message)
+        except PerceptionError as error:
+            self.unread_reason = str(error)
+            raise
+        self.images_read += 1
+        return image
+
     def _refuse_other_size(self, image: Image) -> None:
         self.size_flaw = ""
         if self.calibration is None:
@@ -313,6 +333,6 @@ class EdgeStream:
         return draw_overlay(self._image, self.latest, mask, self.reason, self._camera, instrument)
 
 
-def _read(message: Any) -> Image:
-    refuse_stamp(message.header)
+def read_image(message: Any) -> Image:
+    """Return the picture of a sensor_msgs/Image or sensor_msgs/CompressedImage. Raises PerceptionError."""
     return image_from_compressed(message) if hasattr(message, "format") else image_from_message(message)

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from knee_gap_core.node.parameter_rules import broken_rule
 from knee_gap_core.values.errors import BadInputError, MeasurementError
@@ -174,7 +174,7 @@ def width_after(situation: Situation, offset: Floats) -> float:
         return inf
     edges = edges_after(situation, lens)
     opening = opening_of(unit(situation.points - lens), edges.bearings)
-    radius = float(norm.ppf(0.5 + 0.5 * situation.confidence_level))
+    radius = float(ndtri(0.5 + 0.5 * situation.confidence_level))
     found = instrument_gap(fitted, lens, opening, edges, radius)
     return found.upper - found.lower
 

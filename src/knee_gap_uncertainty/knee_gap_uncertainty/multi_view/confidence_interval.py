@@ -8,7 +8,7 @@ soon as the ellipsoid reaches infinity. `docs/results/coverage.md` shows how oft
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
@@ -51,7 +51,7 @@ def confidence_interval(fit: MultiViewFit, level: float = 0.95) -> ConfidenceInt
     if not 0.0 < level < 1.0:
         raise BadInputError(f"the confidence level must lie inside (0, 1), not {level!r}")
     lower, upper = interval_ends(
-        fit.frames, fit.unknowns, fit.unknowns_covariance, float(norm.ppf(0.5 + 0.5 * level)), fit.bend
+        fit.frames, fit.unknowns, fit.unknowns_covariance, float(ndtri(0.5 + 0.5 * level)), fit.bend
     )
     variation = fit.inverse_depth_variation
     if not variation <= LARGEST_INVERSE_DEPTH_VARIATION:

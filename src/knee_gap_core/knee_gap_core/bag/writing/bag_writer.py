@@ -138,9 +138,7 @@ class BagWriter:
 
     def write(self, topic: str, message: object, time_ns: int) -> None:
         """Serialise a message of `knee_gap_core.bag.message_types` and write it with its time [ns]."""
-        record = self._known(topic)
-        data = bytes(typestore().serialize_cdr(message, record.msgtype))
-        self.write_raw(topic, data + bytes(-len(data) % _DDS_ALIGNMENT), time_ns)
+        self.write_raw(topic, serialized(message, self._known(topic).msgtype), time_ns)
 
     def write_raw(self, topic: str, cdr_bytes: bytes | memoryview, time_ns: int) -> None:
         """Write a serialised message with its time [ns].
@@ -228,6 +226,12 @@ class BagWriter:
     def _unwritten(self, error: OSError) -> BagError:
         kind = DiskFullError if error.errno in _FULL else BagError
         return kind(f"{shown(self.path)}: {reason_of(error)}")
+
+
+def serialized(message: object, msgtype: str) -> bytes:
+    """Return a message of `knee_gap_core.bag.message_types` as a bag keeps it."""
+    data = bytes(typestore().serialize_cdr(message, msgtype))
+    return data + bytes(-len(data) % _DDS_ALIGNMENT)
 
 
 def _flaw_of_replaced(path: Path) -> str:

@@ -1,0 +1,1 @@
+"""The second stage of the pipeline; the first is in `pipeline.py`."""
