@@ -1,6 +1,6 @@
 """Summary of the topics of a bag, and the check whether knee_gap can process it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,9 +8,14 @@ import numpy.typing as npt
 
 from knee_gap_core.bag.bag import BagMessage, BagReader
 from knee_gap_core.bag.errors import BagError
+from knee_gap_perception.edge_tracking.edge_stream import read_image
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_replay.topics import InputTopics
+from knee_gap_replay.whole_bags.replay_clock import OTHER_CLOCK_NS, ReplayClock, replay_clock
 
 _SECOND_NS = 1e9
+_DAY_NS = 86_400e9
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # Largest time between an image and the lens poses before and after it [ns]: max_pose_age of the estimator.
 _MOST_POSE_AGE_NS = 25_000_000
 _ENOUGH = 0.9
@@ -25,6 +30,9 @@ class TopicCheck:
     record_ns: list[int] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
     unreadable: str = ""
+    # Of images: why none could be read, so far.
+    image_flaw: str = ""
+    clock: ReplayClock | None = None
 
     @property
     def times_ns(self) -> npt.NDArray[np.int64]:
@@ -48,11 +56,40 @@ class TopicCheck:
             yield f"stamps run backwards {backwards} times"
         if repeated := int(np.count_nonzero(steps == 0)):
             yield f"{repeated} stamps repeated"
-        if self.stamp_ns:
-            latency = (np.asarray(self.record_ns) - self.times_ns) * 1e-6
-            yield f"latency {np.median(latency):.1f} ms, at most {latency.max():.1f} ms"
+        yield from self._latency()
         if self.unreadable:
             yield self.unreadable
+
+    @property
+    def lags_ns(self) -> npt.NDArray[np.int64]:
+        """Times from stamp to recording."""
+        return np.asarray(self.record_ns, dtype=np.int64) - self.times_ns
+
+    def _latency(self) -> Iterator[str]:
+        if not self.stamp_ns:
+            return
+        if abs(lag_ns := int(np.median(self.lags_ns))) < OTHER_CLOCK_NS:
+            latency = self.lags_ns * 1e-6
+            yield f"latency {np.median(latency):.1f} ms, at most {latency.max():.1f} ms"
+            return
+        when = "after" if lag_ns > 0 else "before"
+        yield f"recorded {abs(lag_ns) / _DAY_NS:.1f} days {when} it was stamped"
+        if self.clock is not None:
+            latency = self.clock.latency_ns(np.asarray(self.record_ns), self.times_ns) * 1e-6
+            words = f"{np.median(latency):.1f} ms, at most {latency.max():.1f} ms"
+            yield f"{self.clock.words}: latency above the least {words}"
+
+
+def _set_clocks(checks: Iterable[TopicCheck]) -> None:
+    """Find the clock of a replay: of topics with stamps as far from their recording as each other."""
+    far = [check for check in checks if check.stamp_ns and abs(np.median(check.lags_ns)) >= OTHER_CLOCK_NS]
+    while far:
+        lag_ns = np.median(far[0].lags_ns)
+        alike = [check for check in far if abs(np.median(check.lags_ns) - lag_ns) < OTHER_CLOCK_NS]
+        far = [check for check in far if all(check is not one for one in alike)]
+        clock = replay_clock([(np.asarray(one.record_ns, dtype=np.int64), one.times_ns) for one in alike])
+        for check in alike:
+            check.clock = clock
 
 
 def check_topics(reader: BagReader) -> dict[str, TopicCheck]:
@@ -62,7 +99,19 @@ def check_topics(reader: BagReader) -> dict[str, TopicCheck]:
         check = checks[message.topic]
         check.record_ns.append(message.time_ns)
         _check_message(reader, message, check)
+        if message.msgtype in _IMAGES and (check.image_flaw or len(check.record_ns) == 1):
+            check.image_flaw = _image_flaw(reader, message)
+    _set_clocks(checks.values())
     return checks
+
+
+def _image_flaw(reader: BagReader, message: BagMessage) -> str:
+    """Why an image cannot be read; empty if it can."""
+    try:
+        read_image(reader.deserialize(message))
+    except (BagError, PerceptionError) as error:
+        return str(error)
+    return ""
 
 
 def _check_message(reader: BagReader, message: BagMessage, check: TopicCheck) -> None:
@@ -84,6 +133,8 @@ def reasons_against(checks: Mapping[str, TopicCheck], topics: InputTopics) -> li
     """Return the reasons why knee_gap cannot process a bag with these topics; empty if it can."""
     usable = {name for name, check in checks.items() if check.record_ns and not check.unreadable}
     reasons = [f"no readable message on {name}" for name in topics if name not in usable]
+    if topics.image in usable and (flaw := checks[topics.image].image_flaw):
+        reasons.append(f"no image on {topics.image} could be read: {flaw}")
     if topics.image in usable and topics.body_pose in usable:
         share = _share_between_poses(checks[topics.image].times_ns, checks[topics.body_pose].times_ns)
         if share < _ENOUGH:

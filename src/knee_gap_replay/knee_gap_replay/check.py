@@ -8,6 +8,8 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.command_line import Parser, run
 from knee_gap_replay.bag_check import TopicCheck, check_topics, reasons_against
 from knee_gap_replay.topics import add_topic_arguments, topics_from
+from knee_gap_replay.whole_bags.output import add_force_argument
+from knee_gap_replay.whole_bags.recovery import recover
 
 
 def _line(check: TopicCheck, width: int) -> str:
@@ -27,6 +29,10 @@ def _run(arguments: argparse.Namespace) -> int:
         reasons = reasons_against(checks, topics_from(arguments, reader.topics))
         losses = len(reader.losses)
     print(f"{losses} damaged or missing parts" if losses else "complete and undamaged")
+    if arguments.recover is not None:
+        saved = recover(arguments.bag, arguments.recover, replace=arguments.force)
+        print(f"{saved.message_count} messages of {saved.topic_count} topics saved in {arguments.recover}")
+        return 0
     print("not usable: " + "; ".join(reasons) if reasons else "usable")
     return 1 if reasons else 0
 
@@ -34,6 +40,10 @@ def _run(arguments: argparse.Namespace) -> int:
 def _parser() -> Parser:
     parser = Parser(prog="check", description=__doc__)
     parser.add_argument("bag", metavar="BAG", help="bag folder or .mcap file")
+    parser.add_argument(
+        "--recover", metavar="OUT", help="save every complete message of a damaged bag in a new one"
+    )
+    add_force_argument(parser)
     add_topic_arguments(parser)
     return parser
 

@@ -138,8 +138,8 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes, re
     ("metadata", "reason"),
     [
         (
-            "storage_identifier: sqlite3\n  compression_mode: ''",
-            "stored as sqlite3; convert it",
+            "storage_identifier: leveldb\n  compression_mode: ''",
+            "stored as leveldb; convert it",
         ),
         ("storage_identifier: mcap\n  compression_mode: FILE", "compressed by file; convert it"),
         (None, "holds no MCAP file"),

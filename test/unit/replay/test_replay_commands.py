@@ -4,6 +4,8 @@ import re
 import signal
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
@@ -13,10 +15,11 @@ from knee_gap_replay import check, process, processing
 from knee_gap_replay.whole_bags import one_bag
 
 IMAGE, INFO, POSE = "/knee_gap/image_raw/compressed", "/knee_gap/camera_info", "/knee_gap/scope_body/pose"
+PICTURE = cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes()
 
 
-def write(path: Path, *, pose_from_ms: int = 0, skip: str = "") -> Path:
-    """Write a second of empty images at 50 Hz with poses at 100 Hz."""
+def write(path: Path, *, pose_from_ms: int = 0, skip: str = "", picture: bytes = b"") -> Path:
+    """Write a second of images at 50 Hz, empty by default, with poses at 100 Hz."""
     with BagWriter(path) as bag:
         for topic, msgtype, period_ms, begin_ms in (
             (IMAGE, "sensor_msgs/msg/CompressedImage", 20, 10),
@@ -29,6 +32,8 @@ def write(path: Path, *, pose_from_ms: int = 0, skip: str = "") -> Path:
             for stamp_ms in range(begin_ms, 1000, period_ms):
                 message = blank(msgtype)
                 message.header.stamp.nanosec = stamp_ms * 1_000_000
+                if topic == IMAGE:
+                    message.data = np.frombuffer(picture, np.uint8)
                 bag.write(topic, message, (stamp_ms + 5) * 1_000_000)
     return path
 
@@ -111,7 +116,7 @@ def test_process_replaces_its_results_on_demand_and_its_input_never(
 
 
 def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert check.main([str(write(tmp_path / "bag"))]) == 0
+    assert check.main([str(write(tmp_path / "bag", picture=PICTURE))]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2:] == ["complete and undamaged", "usable"]
     assert any(POSE in line and "100.0 Hz" in line and "latency 5.0 ms" in line for line in lines)
@@ -128,7 +133,9 @@ def test_check_tells_a_usable_bag(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_check_tells_why_a_bag_cannot_be_used(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], pose_from_ms: int, skip: str, reason: str
 ) -> None:
-    assert check.main([str(write(tmp_path / "bag", pose_from_ms=pose_from_ms, skip=skip))]) == 1
+    assert (
+        check.main([str(write(tmp_path / "bag", pose_from_ms=pose_from_ms, skip=skip, picture=PICTURE))]) == 1
+    )
     assert capsys.readouterr().out.splitlines()[-1] == reason
 
 

@@ -1,7 +1,7 @@
 """Bags of ROS 2, read without ROS.
 
-A bag is a folder with `metadata.yaml` and MCAP files, as `ros2 bag` and Foxglove open it; a bare `.mcap` is
-read too. Times are integer nanoseconds.
+A bag is a folder with `metadata.yaml` and MCAP or SQLite files, as `ros2 bag` opens it; a bare `.mcap` or
+`.db3` is read too. Times are integer nanoseconds.
 """
 
 import os
@@ -16,17 +16,18 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 from knee_gap_core.bag import qos as qos_profiles
+from knee_gap_core.bag import sqlite_file
 from knee_gap_core.bag.bag_paths import missing_bag
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.former_names import topic_today, type_today
-from knee_gap_core.bag.mcap_file import McapFile, in_time_order, mcap_files
+from knee_gap_core.bag.mcap_file import BagFile, McapFile, in_time_order, storage_files
 from knee_gap_core.bag.message_types import full_name, known_type, typestore
 from knee_gap_core.bag.writing.bag_writer import BagWriter as BagWriter
 from knee_gap_core.bag.writing.mcap_storage import METADATA_RECORD
-from knee_gap_core.user_files import FileError, read_yaml
+from knee_gap_core.user_files import FileError, open_file, read_yaml
 
 _CONVERT = "convert it first: rosbags-convert --src IN --dst OUT --dst-storage mcap"
-_STAMP_END = 12
+_CDR_HEAD, _STAMP_END = 4, 12
 _HEADER_FIELD = ("header", (Nodetype.NAME, "std_msgs/msg/Header"))
 
 
@@ -47,6 +48,8 @@ class Topic(NamedTuple):
     encoding: str
     definition: str
     type_hash: str
+    schema_encoding: str = "ros2msg"
+    definition_bytes: bytes = b""
 
 
 class BagReader:
@@ -56,20 +59,22 @@ class BagReader:
     bag's own (custom data). Topics and types recorded under former names appear under those of today, and
     `renamed` says so in one line. What is damaged is left out and named, one line each, in the log and in
     `losses`. Raises BagError where there is no bag, or not one that can be read.
+    To `salvage` is to keep all names as recorded, and to read what is complete in a chunk that is cut, too.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(self, path: str | PathLike[str], *, salvage: bool = False) -> None:
         self.path = Path(path)
+        self._salvage = salvage
         self.metadata: dict[str, str] = {}
         self._stores: dict[str, Typestore] = {}
         self._has_header: dict[str, bool] = {}
-        self._files: list[McapFile] = []
+        self._files: list[BagFile] = []
         self._missing: list[str] = []
         # Names as recorded, by names of today.
         self._recorded: dict[str, str] = {}
         try:
             for file in self._locate():
-                self._files.append(McapFile(file))
+                self._files.append(self._opened(file))
         except BaseException:
             self.close()
             raise
@@ -126,9 +131,11 @@ class BagReader:
         topic = self.details[message.topic]
         if topic.encoding != "cdr":
             raise BagError(f"{message.topic} is serialised as '{topic.encoding}'; only cdr can be read")
-        store = self._store(message.msgtype, topic.definition)
+        store = self._store(topic)
+        # Some middlewares send nothing but the head of a message without fields.
+        data = message.data if len(message.data) != _CDR_HEAD else message.data + bytes(1)
         try:
-            return store.deserialize_cdr(message.data, message.msgtype)
+            return store.deserialize_cdr(data, message.msgtype)
         except Exception as error:  # rosbags' generated code fails in many ways on bytes that do not fit
             reason = str(error) or type(error).__name__
             raise BagError(f"a {message.msgtype} on {message.topic} cannot be read: {reason}") from None
@@ -139,8 +146,8 @@ class BagReader:
         if topic.encoding != "cdr" or len(message.data) < _STAMP_END:
             return None
         if message.msgtype not in self._has_header:
-            fields = self._store(message.msgtype, topic.definition).fielddefs[message.msgtype][1]
-            self._has_header[message.msgtype] = fields[0] == _HEADER_FIELD
+            fields = self._store(topic).fielddefs[message.msgtype][1]
+            self._has_header[message.msgtype] = fields[:1] == [_HEADER_FIELD]
         if not self._has_header[message.msgtype]:
             return None
         # CDR: one byte, then the order of bytes (odd: little endian), options, and the message itself.
@@ -151,8 +158,24 @@ class BagReader:
         today = {recorded: name for name, recorded in self._recorded.items()}
         recorded_topics = None if topics is None else frozenset(self._recorded[name] for name in topics)
         for entry in in_time_order(self._files, recorded_topics):
-            msgtype = type_today(full_name(entry.schema_name))
+            msgtype = self._type_today(entry.schema_name)
             yield BagMessage(today.get(entry.topic, entry.topic), msgtype, entry.time_ns, entry.data)
+
+    def _opened(self, path: Path) -> BagFile:
+        try:
+            with open_file(path) as file:
+                is_sqlite = file.read(len(sqlite_file.MAGIC)) == sqlite_file.MAGIC
+        except (FileError, OSError):
+            is_sqlite = False
+        if is_sqlite or path.suffix == ".db3":
+            return sqlite_file.SqliteFile(path)
+        return McapFile(path, salvage=self._salvage)
+
+    def _topic_today(self, name: str) -> str:
+        return name if self._salvage else topic_today(name)
+
+    def _type_today(self, name: str) -> str:
+        return full_name(name) if self._salvage else type_today(full_name(name))
 
     def _locate(self) -> list[Path]:
         if not self.path.is_dir():
@@ -164,7 +187,7 @@ class BagReader:
         names = [Path(str(name)).name for name in named] if isinstance(named, list) else []
         files = [self.path / name for name in dict.fromkeys(names)]
         self._missing += [f"{file.name} is missing" for file in files if not file.exists()]
-        files = [file for file in files if file.exists()] or mcap_files(self.path)
+        files = [file for file in files if file.exists()] or storage_files(self.path)
         if not files:
             raise BagError(missing_bag(self.path) or f"{self.path} holds no file of its bag")
         custom = information.get("custom_data")
@@ -184,7 +207,7 @@ class BagReader:
         except (FileError, LookupError, TypeError, AttributeError):
             self._missing.append("metadata.yaml is damaged; read without it")
             return {}
-        if storage != "mcap":
+        if storage not in ("mcap", "sqlite3"):
             raise BagError(f"{self.path} is stored as {storage}; {_CONVERT}")
         if mode != "none":
             raise BagError(f"{self.path} is compressed by {mode}; {_CONVERT}")
@@ -203,23 +226,33 @@ class BagReader:
                 schema = file.schemas.get(channel.schema_id)
                 offered = qos_profiles.parse(channel.metadata.get("offered_qos_profiles", ""))
                 # A bag that has both was recorded in a time of change: each stays what it is.
-                name = channel.topic if topic_today(channel.topic) in names else topic_today(channel.topic)
+                today = self._topic_today(channel.topic)
+                name = channel.topic if today in names else today
                 self._recorded[name] = channel.topic
                 known = details.get(name) or Topic(
-                    msgtype=type_today(full_name(schema.name)) if schema else "",
+                    msgtype=self._type_today(schema.name) if schema else "",
                     qos=(),
                     encoding=channel.message_encoding,
                     definition=schema.data.decode(errors="replace") if schema else "",
                     type_hash=channel.metadata.get("topic_type_hash", ""),
+                    schema_encoding=schema.encoding if schema else "",
+                    definition_bytes=schema.data if schema else b"",
                 )
                 details[name] = known._replace(qos=tuple(dict.fromkeys((*known.qos, *offered))))
         return details
 
-    def _store(self, msgtype: str, definition: str) -> Typestore:
+    def _store(self, topic: Topic) -> Typestore:
         """Return a store with the type as the bag defines it, or as Jazzy does where the bag does not."""
+        msgtype, definition, schema_encoding = topic.msgtype, topic.definition, topic.schema_encoding
         if not definition:
-            known_type(msgtype)
-            return typestore()
+            try:
+                known_type(msgtype)
+            except BagError:
+                if schema_encoding != "ros2msg":
+                    raise
+                definition = "\n"  # a message without fields is defined by no text
+            else:
+                return typestore()
         if msgtype not in self._stores:
             store = get_typestore(Stores.EMPTY)
             is_idl = definition.startswith("=" * 80 + "\nIDL: ")

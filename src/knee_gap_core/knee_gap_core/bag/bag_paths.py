@@ -8,10 +8,10 @@ from knee_gap_core.user_files import FileError, open_file, reason_of, shown
 
 
 def missing_bag(path: Path) -> str:
-    """Why there can be no MCAP bag at `path`, a file or a folder; empty where there may be one."""
+    """Why there can be no bag at `path`, a file or a folder; empty where there may be one."""
     try:
         if stat.S_ISDIR(os.stat(path).st_mode):
-            found = any(name.endswith(".mcap") for name in os.listdir(path))
+            found = any(name.endswith((".mcap", ".db3")) for name in os.listdir(path))
             return "" if found else f"{shown(path)} holds no MCAP file"
         with open_file(path) as file:
             return "" if file.read(1) else f"{shown(path)} is empty"

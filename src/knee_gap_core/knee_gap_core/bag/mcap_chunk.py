@@ -85,6 +85,29 @@ def chunk_records(data: bytes, offset: int, budget: Budget) -> list[McapRecord]:
     return [record for place in places if (record := _record(unpacked, *place)) is not None]
 
 
+def cut_chunk_records(data: bytes, offset: int, budget: Budget) -> list[McapRecord]:
+    """Return the records that are complete in a chunk whose end is missing.
+
+    The checksum is of the whole chunk, so that these records cannot be checked.
+    """
+    _, _, size, _, name_length = _HEAD.unpack_from(data)
+    place = _HEAD.size + name_length
+    compression = data[_HEAD.size : place].decode()
+    packed = data[place + _LENGTH.size :]
+    size = min(size, MOST_CHUNK_BYTES)
+    if compression:
+        budget.unpack(offset, size)
+    if compression == "zstd":
+        unpacked = zstandard.ZstdDecompressor().decompressobj().decompress(packed)[:size]
+    elif compression == "lz4":
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
+    else:
+        unpacked = packed[:size]
+    places = _places(unpacked, budget.most_records(offset), cut=True)
+    budget.hold(offset, len(places))
+    return [record for place in places if (record := _record(unpacked, *place)) is not None]
+
+
 def _unpacked(compression: str, packed: bytes, size: int) -> bytes:
     """Return `packed` unpacked. Raises BagError where that has not the given size [bytes]."""
     if not compression:
@@ -112,18 +135,22 @@ def _up_to(read: Callable[[int], bytes], size: int) -> bytes:
     return b"".join(parts)
 
 
-def _places(data: bytes, most: int) -> list[tuple[int, int, int]]:
+def _places(data: bytes, most: int, *, cut: bool = False) -> list[tuple[int, int, int]]:
     """Return kind, begin and end of each record of an unpacked chunk.
 
-    Raises BagError where one is cut, and where there are more than `most`.
+    Raises BagError where there are more than `most`, and where one is cut, unless the chunk may be `cut`.
     """
     places: list[tuple[int, int, int]] = []
     place, least = 0, _RECORD_HEAD.size
     while place < len(data):
         if place + least > len(data):
+            if cut:
+                break
             raise BagError("a record in it is cut")
         opcode, length = _RECORD_HEAD.unpack_from(data, place)
         begin, place = place + least, place + least + length
+        if cut and place > len(data):
+            break
         if opcode == 0 or place > len(data):
             raise BagError("a record in it is damaged")
         if len(places) >= most:

@@ -13,7 +13,7 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, Protocol
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -31,7 +31,13 @@ from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.summary import Summary
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.bag.mcap_chunk import MOST_CHUNK_BYTES, MOST_RECORD_BYTES, Budget, chunk_records
+from knee_gap_core.bag.mcap_chunk import (
+    MOST_CHUNK_BYTES,
+    MOST_RECORD_BYTES,
+    Budget,
+    chunk_records,
+    cut_chunk_records,
+)
 from knee_gap_core.user_files import FileError, open_file, shown
 
 _LOG = logging.getLogger(__name__)
@@ -74,11 +80,12 @@ class McapFile:
 
     `counts` are the messages by topic, as the index tells them; None without one. `losses` has one line for
     each part that is not readable; it grows while blocks are read. Raises BagError where the file is no MCAP
-    file at all or cannot be opened.
+    file at all or cannot be opened. To `salvage` is to read what is complete in a chunk that is cut, too.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
         self.path = path
+        self._salvage = salvage
         self.losses: list[str] = []
         self._told: set[str] = set()
         self.schemas: dict[int, Schema] = {}
@@ -194,6 +201,8 @@ class McapFile:
             end = offset + _RECORD_HEAD.size + length
             is_misplaced = opcode == Opcode.MESSAGE and any(block.is_chunk for block in self.blocks[:1])
             if end > self._size or opcode not in _OPCODES or is_misplaced:
+                if self._salvage and opcode == Opcode.CHUNK and end > self._size:
+                    self._note(opcode, offset, length)
                 break
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 if opcode == Opcode.DATA_END and self.blocks and self.blocks[0].is_chunk:
@@ -241,10 +250,12 @@ class McapFile:
         opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
         if length != block.length or opcode != (Opcode.CHUNK if block.is_chunk else Opcode.MESSAGE):
             raise BagError("its head is damaged")
-        if length > MOST_CHUNK_BYTES:
+        if length > MOST_CHUNK_BYTES and not self._salvage:
             raise BagError(f"longer than {MOST_CHUNK_BYTES >> 20} MiB")
-        data = self._file.read(length)
+        data = self._file.read(min(length, MOST_CHUNK_BYTES))
         if len(data) < length:
+            if self._salvage and block.is_chunk:
+                return cut_chunk_records(data, block.offset, self._budget)
             raise BagError("the file ends in it")
         if not block.is_chunk:
             return [Message.read(ReadDataStream(io.BytesIO(data)), length)]
@@ -289,9 +300,27 @@ def _summary_of(tail: bytes) -> Summary:
     return summary
 
 
-def in_time_order(files: Iterable[McapFile], topics: Collection[str] | None) -> Iterator[Entry]:
+class BagFile(Protocol):
+    """One file of a bag, in whatever storage."""
+
+    path: Path
+    losses: list[str]
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+    metadata: dict[str, dict[str, str]]
+    blocks: list[Block]
+    counts: Counter[str] | None
+
+    def read(self, block: Block) -> list[Entry]:
+        """Return the messages of a block."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+def in_time_order(files: Iterable[BagFile], topics: Collection[str] | None) -> Iterator[Entry]:
     """Yield the messages of all files, by time, then file, then place; holds only blocks that overlap."""
-    by_number: Mapping[int, McapFile] = dict(enumerate(files))
+    by_number: Mapping[int, BagFile] = dict(enumerate(files))
     blocks = sorted(
         (block.start_ns, number, block) for number, file in by_number.items() for block in file.blocks
     )
@@ -310,11 +339,15 @@ def in_time_order(files: Iterable[McapFile], topics: Collection[str] | None) -> 
         yield heapq.heappop(waiting)[-1]
 
 
-def mcap_files(folder: Path) -> list[Path]:
-    """Return the MCAP files of a folder, in the order of their numbers."""
+def storage_files(folder: Path) -> list[Path]:
+    """Return the MCAP files of a folder, else its SQLite files, in the order of their numbers."""
 
     def key(path: Path) -> tuple[str, int]:
         stem, _, number = path.stem.rpartition("_")
         return (stem, int(number)) if number.isdecimal() else (path.stem, -1)
 
-    return sorted((folder / name for name in os.listdir(folder) if name.endswith(".mcap")), key=key)
+    names = os.listdir(folder)
+    for suffix in (".mcap", ".db3"):
+        if files := [folder / name for name in names if name.endswith(suffix)]:
+            return sorted(files, key=key)
+    return []

@@ -123,7 +123,7 @@ class BagWriter:
             qos = [PROFILES[qos]]
         definition, _ = typestore().generate_msgdef(msgtype, ros_version=2)
         type_hash = typestore().hash_rihs01(msgtype)
-        self.copy_topic(TopicRecord(name, msgtype, definition, type_hash, "", "cdr"), qos)
+        self.copy_topic(TopicRecord(name, msgtype, definition.encode(), type_hash), qos)
 
     def copy_topic(self, topic: TopicRecord, qos: Sequence[Qos]) -> None:
         """Announce a topic as another bag has it, whether its type is known here or not."""

@@ -32,10 +32,11 @@ class TopicRecord(NamedTuple):
 
     name: str
     msgtype: str
-    definition: str
+    definition: bytes
     type_hash: str
-    qos: str
-    serialization: str
+    qos: str = ""
+    serialization: str = "cdr"
+    encoding: str = "ros2msg"
 
 
 class McapStorage:
@@ -78,12 +79,10 @@ class McapStorage:
     def add_topic(self, topic: TopicRecord) -> None:
         """Write a topic and the definition of its type."""
         if topic.msgtype not in self._schemas:
-            encoding = "ros2idl" if topic.definition.startswith("=" * 80 + "\nIDL: ") else "ros2msg"
-            if not topic.definition:
-                encoding = ""
-            data = topic.definition.encode()
-            self._schemas[topic.msgtype] = self._writer.register_schema(topic.msgtype, encoding, data)
-            self._chunk_bytes += len(data) + _MESSAGE_HEAD_BYTES
+            self._schemas[topic.msgtype] = self._writer.register_schema(
+                topic.msgtype, topic.encoding, topic.definition
+            )
+            self._chunk_bytes += len(topic.definition) + _MESSAGE_HEAD_BYTES
         self._channels[topic.name] = self._writer.register_channel(
             topic.name,
             topic.serialization,
