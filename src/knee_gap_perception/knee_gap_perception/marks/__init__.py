@@ -1,0 +1,1 @@
+"""Marks made by hand on real pictures, and the command `mark` that makes them."""
