@@ -10,7 +10,7 @@ setup(
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",
     packages=find_packages(),
-    package_data={"": ["py.typed"]},
+    package_data={"": ["py.typed", "*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + NAME]),
         ("share/" + NAME, ["package.xml"]),
@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "calibrate = knee_gap_perception.entry_points:calibrate",
+            "mark = knee_gap_perception.entry_points:mark",
             "segmentation_node = knee_gap_perception.entry_points:segmentation_node",
             "tracker_precision = knee_gap_perception.entry_points:tracker_precision",
             "tracking_node = knee_gap_perception.entry_points:tracking_node",

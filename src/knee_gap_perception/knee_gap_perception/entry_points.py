@@ -3,6 +3,7 @@
 from knee_gap_core.node.entry import entry
 
 calibrate = entry("knee_gap_perception.calibrate.command")
+mark = entry("knee_gap_perception.marks.command")
 segmentation_node = entry("knee_gap_perception.segmentation_node", node=True)
 tracker_precision = entry("knee_gap_perception.tracker_precision.command")
 tracking_node = entry("knee_gap_perception.tracking_node", node=True)
