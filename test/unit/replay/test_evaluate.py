@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from knee_gap_core.values.arrays import Mask
@@ -13,6 +14,9 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.evaluation.difference_picture import FN, FP, TN, TP, difference_picture
 from knee_gap_perception.evaluation.image_error import edge_error, overlap
 from knee_gap_perception.evaluation.presets import PRESETS, image_error_preset
+from knee_gap_perception.marks.marked_picture import Decision, MarkedPicture, Region
+from knee_gap_perception.marks.marks_file import write_marks
+from knee_gap_perception.marks.picture_files import sha256_of
 from knee_gap_replay.evaluation.command import main
 
 PAPER = EquiangularCamera(1280, 720)
@@ -167,3 +171,67 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert reason in lines[0]
     assert main([str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 1
     assert "it holds no MCAP file" in capsys.readouterr().err
+
+
+def marked_folder(folder: Path) -> tuple[Path, Path]:
+    """Folders of pictures and of masks, with marks of a gap, of no gap and of an unclear picture."""
+    pictures, masks, marks = folder / "pictures", folder / "masks", []
+    pictures.mkdir()
+    masks.mkdir()
+    for name, decision in (("a", Decision.GAP), ("b", Decision.NO_GAP), ("c", Decision.UNCLEAR)):
+        image = np.random.default_rng(1).integers(90, 120, (96, 128, 3), np.uint8)
+        image[40:56, 20:108] = 8 if decision is Decision.GAP else 100
+        cv2.imwrite(str(pictures / f"{name}.png"), image)
+        regions = {Region.UNCLEAR: (box(90, 0, 127, 95),)}
+        if decision is Decision.GAP:
+            regions[Region.GAP] = (box(20, 40, 107, 55),)
+        marks.append(
+            MarkedPicture(
+                f"{name}.png", sha256_of(pictures / f"{name}.png"), 128, 96, f"site {name}", "knee", decision,
+                regions=regions,
+            )
+        )  # fmt: skip
+        predicted = np.zeros((96, 128), bool)
+        predicted[44:56, 20:128] = decision is Decision.GAP
+        save(masks, f"{name}.png", predicted)
+    write_marks(folder / "marks.json", marks)
+    return pictures, masks
+
+
+def box(left: float, top: float, right: float, bottom: float) -> npt.NDArray[np.float64]:
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+
+
+def test_masks_against_marks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pictures, masks = marked_folder(tmp_path)
+    arguments = [str(masks), str(tmp_path / "marks.json"), "--pictures", str(pictures)]
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
+    rows = {row["set"]: row for row in csv.DictReader((tmp_path / "out" / "table.csv").open())}
+    assert set(rows) == {"site a", "site b", "all sets"}
+    # 12 of the 16 marked rows; what lies in the unclear part counts on neither side.
+    assert float(rows["site a"]["dice_mean"]) == pytest.approx(2 * 12 / (12 + 16), abs=0.001)
+    assert float(rows["site a"]["g0_px"]) == pytest.approx(4.0, abs=0.5)
+    assert float(rows["site b"]["dice_mean"]) == 1.0
+    save(masks, "a.png", np.zeros((10, 10), bool))
+    assert main([*arguments, "--out", str(tmp_path / "again")]) == 1
+    assert "a.png has 10x10 px, a.png was marked with 128x96 px" in capsys.readouterr().err
+
+
+def test_marked_pictures_are_segmented_here_and_must_be_those(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures, masks = marked_folder(tmp_path)
+    arguments = [str(pictures), str(tmp_path / "marks.json"), "--out", str(tmp_path / "out")]
+    assert main([*arguments, "--segmentation", "otsu"]) == 0
+    rows = {row["set"]: row for row in csv.DictReader((tmp_path / "out" / "table.csv").open())}
+    assert float(rows["site a"]["dice_mean"]) > 0.9
+    capsys.readouterr()
+    (pictures / "b.png").write_bytes((pictures / "a.png").read_bytes())
+    assert main(arguments) == 1
+    assert main([str(masks), str(tmp_path / "none.json")]) == 1
+    assert main([str(tmp_path), str(tmp_path / "marks.json"), "--pictures", str(pictures)]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("evaluate: ")]
+    assert len(lines) == 3
+    assert "b.png is not the picture that was marked" in lines[0]
+    assert "No such file" in lines[1]
+    assert "no mask in" in lines[2]

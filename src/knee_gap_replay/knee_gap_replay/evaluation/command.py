@@ -22,6 +22,7 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.evaluation.difference_picture import difference_picture, panel
 from knee_gap_perception.evaluation.image_error import EdgeError, Overlap, edge_error, overlap, rms
 from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK
+from knee_gap_replay.evaluation.marked_pairs import is_marks, marked_pairs
 from knee_gap_replay.evaluation.pairs import SHEET_ROWS, BagTopics, Pair, bag_pairs, folder_pairs, is_bag
 
 
@@ -140,14 +141,20 @@ def _write_picture(path: Path, image: Image) -> None:
 
 def _parser() -> Parser:
     parser = Parser(prog="evaluate", description=__doc__)
-    parser.add_argument("predicted", type=Path, help="folder of predicted masks, or a bag")
+    parser.add_argument(
+        "predicted",
+        type=Path,
+        help="folder of predicted masks, or a bag; with marks and without --pictures: folder of the pictures",
+    )
     parser.add_argument(
         "marked",
         type=Path,
         nargs="?",
-        help="folder of hand-marked masks with the same names, or a bag with ground truth",
+        help="folder of hand-marked masks of the same names, a file of marks (.json), or a bag with truth",
     )
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="the images, for the sheet")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="FOLDER", help="the images, for the sheet and for marks"
+    )
     parser.add_argument("--out", type=Path, default=Path("out/evaluate"), metavar="FOLDER")
     parser.add_argument(
         "--calibration",
@@ -165,7 +172,7 @@ def _parser() -> Parser:
     parser.add_argument(
         "--segmentation",
         choices=WITHOUT_NETWORK,
-        help="segment the bag's images so; without it, if the bag has no masks, as segmentation_node does",
+        help="segment the images so; without it, if there are no masks, as segmentation_node does",
     )
     return parser
 
@@ -174,6 +181,8 @@ def _pairs(arguments: argparse.Namespace) -> tuple[int, Iterator[Pair]]:
     """Pairs of masks that the arguments name. Raises PerceptionError."""
     if arguments.every < 1:
         raise PerceptionError(f"--every must be at least 1, not {arguments.every}")
+    if is_marks(arguments.marked):
+        return marked_pairs(arguments.predicted, arguments.marked, arguments.pictures, arguments.segmentation)
     if not is_bag(arguments.predicted):
         if arguments.marked is None:
             if not arguments.predicted.is_dir():
@@ -194,7 +203,7 @@ def _camera(arguments: argparse.Namespace) -> Camera | None:
     if arguments.calibration is not None:
         return load_calibration(arguments.calibration).require_camera().camera()
     for path in (arguments.marked, arguments.predicted):
-        if path is not None and is_bag(path):
+        if path is not None and not is_marks(path) and is_bag(path):
             info = CalibrationBag(path).camera_info(arguments.camera_info_topic)
             if info is not None:
                 return camera_from_info(info)

@@ -56,8 +56,8 @@ def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[
 
     Raises PerceptionError if a folder is missing, if no name is in both, or if a file is not an image.
     """
-    predictions, marks = _files(predicted), _files(marked)
-    views = _files(pictures) if pictures else {}
+    predictions, marks = mask_files(predicted), mask_files(marked)
+    views = mask_files(pictures) if pictures else {}
     names = sorted(predictions.keys() & marks.keys())
     if not names:
         raise PerceptionError(f"no mask in {predicted} has the name of one in {marked}")
@@ -69,7 +69,7 @@ def folder_pairs(predicted: Path, marked: Path, pictures: Path | None) -> tuple[
             view = _image(views[name]) if name in views else None
             folder = name.parent.as_posix()
             label = "all" if folder == "." else folder
-            yield Pair(label, name.name, _mask(predictions[name]), _mask(marks[name]), view)
+            yield Pair(label, name.name, read_mask(predictions[name]), read_mask(marks[name]), view)
 
     return len(names), pairs()
 
@@ -134,7 +134,8 @@ def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[i
     return dict(islice(((s, image) for s, image in bag.images(topic) if s in wanted), SHEET_ROWS))
 
 
-def _files(folder: Path) -> dict[Path, Path]:
+def mask_files(folder: Path) -> dict[Path, Path]:
+    """Images of a folder by their path in it without suffix. Raises PerceptionError if it is none."""
     if not folder.is_dir():
         raise PerceptionError(f"{shown(folder)} is not a folder")
     return {
@@ -155,7 +156,10 @@ def _image(path: Path) -> Image:
     return np.asarray(image, dtype=np.uint8)
 
 
-def _mask(path: Path) -> Mask:
-    """Mask of the gap: pixels brighter than half, or equal to 1 in masks of 0 and 1."""
+def read_mask(path: Path) -> Mask:
+    """Mask of the gap: pixels brighter than half, or equal to 1 in masks of 0 and 1.
+
+    Raises PerceptionError if it cannot be read.
+    """
     image = _image(path).max(axis=2)
     return np.asarray(image > (0 if image.max() <= 1 else 127))
