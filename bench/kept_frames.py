@@ -5,6 +5,7 @@ from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
 from knee_gap_simulation.scope.imaging import decoded
@@ -23,6 +24,7 @@ def frames_of(
     # The exposure follows from image to image: every fourth one is not a fourth of all.
     name += f"_{start}_{step}" if (start, step) != (0, 1) else ""
     name += "_closed" if settings.gap is None else ""
+    name += "" if settings.appearance == "plain" else f"_{settings.appearance}"
     kept = folder / name
     files = [kept / f"{index:05d}.npz" for index in range(start, simulator.frame_count, step)]
     if all(file.exists() for file in files):
@@ -48,6 +50,7 @@ def _save(file: Path, frame: SimulatorFrame) -> None:
             shape=frame.gap_mask.shape,
             debris_cover=frame.debris_cover,
             probe=frame.probe,
+            instrument_mask=np.packbits(frame.instrument_mask),
         )
     # A run that is broken off leaves no file that looks whole.
     unfinished.rename(file)
@@ -63,7 +66,12 @@ def _load(file: Path) -> SimulatorFrame:
             image=decoded(jpeg),
             T_world_lens=kept["T_world_lens"],
             T_world_lens_tracked=kept["T_world_lens_tracked"],
-            gap_mask=np.unpackbits(kept["gap_mask"])[: shape[0] * shape[1]].reshape(shape).astype(bool),
+            gap_mask=_mask(kept["gap_mask"], shape),
             debris_cover=kept["debris_cover"],
             probe=kept["probe"],
+            instrument_mask=_mask(kept["instrument_mask"], shape),
         )
+
+
+def _mask(packed: npt.NDArray[np.uint8], shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    return np.unpackbits(packed)[: shape[0] * shape[1]].reshape(shape).astype(bool)

@@ -18,6 +18,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
+            "compare_looks = knee_gap_simulation.entry_points:compare_looks",
             "contact_sheet = knee_gap_simulation.entry_points:contact_sheet",
             "make_bag = knee_gap_simulation.entry_points:make_bag",
             "natnet_server = knee_gap_simulation.entry_points:natnet_server",

@@ -1,4 +1,4 @@
-"""The command `contact_sheet`: one picture of the knee at levels 0 to 3, with real frames if given."""
+"""The command `contact_sheet`: one picture of knees at levels 0 to 3, with real frames if given."""
 
 import sys
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from knee_gap_core.user_files import FileError, open_file
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import LEVELS
 from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.looks.look import Appearance
 from knee_gap_simulation.scope.imaging import ByteImage
 
 _SIZE_PX = 400
@@ -23,11 +24,17 @@ _MOST_FRAMES = 128
 _MOMENTS_S = (1.0, 2.2, 3.0, 1.4)
 
 
-def contact_sheet(seeds: Sequence[int], real: Sequence[ByteImage] = ()) -> ByteImage:
-    """Picture with one row of levels 0 to 3 for each seed, and rows of real frames (h, w, 3) below."""
+def contact_sheet(
+    seeds: Sequence[int], real: Sequence[ByteImage] = (), appearance: str = Appearance.PLAIN
+) -> ByteImage:
+    """Picture with one row of levels 0 to 3 for each seed, and rows of real frames (h, w, 3) below.
+
+    Looks differ from seed to seed: with the appearance "real" each tile of a row has a seed of its own.
+    """
     rows = [_label([f"level {level}" for level in LEVELS])]
+    apart = 0 if appearance == Appearance.PLAIN else 1000
     for seed in tqdm(seeds, desc="rendering", unit="seed", disable=not sys.stderr.isatty()):
-        rows.append(np.hstack([_tile(_moment(level, seed)) for level in LEVELS]))
+        rows.append(np.hstack([_tile(moment(level, seed + apart * level, appearance)) for level in LEVELS]))
         if not sys.stderr.isatty():
             print(f"rendered: seed {seed}", file=sys.stderr)
     if real:
@@ -76,8 +83,9 @@ def _spread_frames(path: Path) -> list[ByteImage]:
     return frames
 
 
-def _moment(level: int, seed: int) -> ByteImage:
-    simulator = KneeSimulator(level, seed)
+def moment(level: int, seed: int, appearance: str = Appearance.PLAIN) -> ByteImage:
+    """An image of a knee, from the middle of its recording."""
+    simulator = KneeSimulator(level, seed, appearance=appearance)
     index = round(_MOMENTS_S[level] * simulator.settings.fps)
     return next(simulator.frames(index, index + 1)).image
 
@@ -104,6 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="output picture, .png or .jpg")
     parser.add_argument("--seeds", type=int, nargs="+", default=[4, 2, 11], help="seeds, one knee per row")
     parser.add_argument(
+        "--appearance", choices=list(Appearance), default=Appearance.PLAIN, help="of the knees (plain)"
+    )
+    parser.add_argument(
         "--beside", type=Path, nargs="*", default=[], help="real frames: pictures, folders of them, or videos"
     )
     arguments = parser.parse_args(argv)
@@ -112,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise SimulationError(f"{arguments.out} must end in .png or .jpg")
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         real = [frame for path in arguments.beside for frame in read_frames(path)]
-        sheet = contact_sheet(arguments.seeds, real)
+        sheet = contact_sheet(arguments.seeds, real, arguments.appearance)
     except (SimulationError, FileError, OSError) as error:
         print(f"contact_sheet: {error}", file=sys.stderr)
         return 1

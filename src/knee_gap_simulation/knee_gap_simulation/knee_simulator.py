@@ -34,9 +34,11 @@ from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Conditions, Difficulty, conditions
 from knee_gap_simulation.knee.ground_truth import PointObservations, SurfacePoints, follow, surface_points
-from knee_gap_simulation.knee.knee_camera import KneeCamera, KneeLight
+from knee_gap_simulation.knee.knee_camera import Dressing, KneeCamera, KneeLight
 from knee_gap_simulation.knee.probe import Probe
 from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.looks.dressing import dressing
+from knee_gap_simulation.looks.look import Appearance, Look
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.clocks import stamp_ns, tracker_times
@@ -66,7 +68,8 @@ class SimulatorFrame:
 
     ``gap_mask`` (height, width): the pixels that look into the gap, past condyle, meniscus and probe.
     ``debris_cover`` (height, width) in [0, 1]: fraction of each pixel covered by debris. ``probe`` (k, 4):
-    the rods of the probe in the scene, empty while it is away.
+    the rods of the probe in the scene, empty while it is away. ``instrument_mask`` (height, width):
+    the pixels that show it.
     """
 
     index: int
@@ -78,6 +81,7 @@ class SimulatorFrame:
     gap_mask: npt.NDArray[np.bool_]
     debris_cover: FloatImage
     probe: Array
+    instrument_mask: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,7 @@ class SimulatorSettings:
     fps: float
     media: Media = IN_SALINE
     portal: float | None = None
+    appearance: Appearance = Appearance.PLAIN
 
     def as_dict(self) -> dict[str, Any]:
         """Settings as plain values for JSON; those that were not given are left out."""
@@ -102,6 +107,8 @@ class SimulatorSettings:
             del values["media"]
         if self.portal is None:
             del values["portal"]
+        if self.appearance is Appearance.PLAIN:
+            del values["appearance"]
         return values
 
 
@@ -124,12 +131,13 @@ class KneeSimulator:
         medium: Medium = "saline",
         calibrated_in: Medium | None = None,
         portal: float | None = None,
+        appearance: str = Appearance.PLAIN,
     ) -> None:
         """Lengths [m]. ``difficulty`` sets single levels by name; the result is the same for any ``workers``.
 
         The knee is filled with ``medium``; ``bench.lens`` is the lens in it, ``Lens()`` the lens in
         ``calibrated_in`` (the same by default). ``portal``: distance from the tip back to the pivot of the
-        scope, as in `HandMotion`.
+        scope, as in `HandMotion`. ``appearance`` "real" draws the look from the seed.
 
         Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
         that does not fit into the joint.
@@ -143,10 +151,19 @@ class KneeSimulator:
             raise SimulationError(f"the duration must lie in [0.05, 600] s, not {duration_s:g} s")
         if not 1.0 <= fps <= 240.0:
             raise SimulationError(f"fps must lie in [1, 240] frames a second, not {fps:g}")
+        if appearance not in list(Appearance):
+            choices = ", ".join(Appearance)
+            raise SimulationError(f"the appearance must be one of {choices}, not '{appearance}'")
         rng = np.random.default_rng([seed, 0x4245])
         drawn_gap, drawn_depth = float(rng.uniform(0.003, 0.008)), float(rng.uniform(0.008, 0.015))
+        levels = Difficulty.at(level, difficulty)
+        self.conditions: Conditions = conditions(levels)
+        self.look, lens = None, Lens()
+        if Appearance(appearance) is Appearance.REAL:
+            self.look = Look.drawn(seed, self.conditions)
+            drawn_gap, lens = self.look.gap, self.look.lens
         self.settings = SimulatorSettings(
-            difficulty=Difficulty.at(level, difficulty),
+            difficulty=levels,
             seed=seed,
             travel_direction=TravelDirection(travel_direction),
             gap=drawn_gap if isinstance(gap, Draw) else gap,
@@ -156,10 +173,12 @@ class KneeSimulator:
             fps=fps,
             media=Media(medium if calibrated_in is None else calibrated_in, medium),
             portal=portal,
+            appearance=Appearance(appearance),
         )
-        self.conditions: Conditions = conditions(self.settings.difficulty)
         self.scene = KneeScene.random(self.settings.gap, seed, self.conditions.roughness)
-        self.lens, self.scope = RefractedLens.of(Lens(), self.settings.media.ratio), Scope()
+        if self.look is not None:
+            self.scene = self.look.shaped(self.scene, travel)
+        self.lens, self.scope = RefractedLens.of(lens, self.settings.media.ratio), Scope()
         self.T_world_scene = world_from_scene(seed)
         self._workers = workers
         self._motion = self._place_hand(rng)
@@ -183,7 +202,7 @@ class KneeSimulator:
         A frame's geometry, noise and debris do not depend on the range. Its exposure does, since it is
         controlled from frame to frame.
         """
-        camera = KneeCamera(self.scene, self.lens, self.conditions, self.settings.seed)
+        camera = KneeCamera(self.scene, self.lens, self.conditions, self.settings.seed, self._dressing())
         indices = range(start, self.frame_count if stop is None else min(stop, self.frame_count), step)
         with ThreadPoolExecutor(self._workers) as pool:
             ahead: deque[tuple[int, Future[KneeLight]]] = deque()
@@ -241,6 +260,12 @@ class KneeSimulator:
         """Times (n,) [s] at 120 Hz, reported body poses and true lens poses (n, 4, 4) in the world."""
         return self._body_times, self._bodies, self._true_lenses()
 
+    def _dressing(self) -> Dressing | None:
+        if self.look is None:
+            return None
+        poses = self._motion.poses(np.linspace(0.0, min(self.settings.duration_s, 3.6), 3))
+        return dressing(self.look, self.scene, self.lens, self.conditions, poses)
+
     def _light(self, camera: KneeCamera, index: int) -> KneeLight:
         time = index / self.settings.fps
         T_scene_lens = self._motion.poses(np.array(time))
@@ -260,6 +285,7 @@ class KneeSimulator:
             gap_mask=seen.gap_mask,
             debris_cover=seen.debris_cover,
             probe=self.probe.joints(time),
+            instrument_mask=seen.instrument_mask,
         )
 
     def _true_lenses(self) -> Array:
@@ -288,6 +314,8 @@ class KneeSimulator:
         settings = self.settings
         hand = Hand(reach_s=3.3, tremor=self.conditions.tremor)
         roll, pitch = rng.uniform(-0.35, 0.35), rng.uniform(-0.10, 0.12)
+        if self.look is not None:
+            roll = self.look.roll
         side, up = rng.uniform(-1.0e-3, 1.0e-3), rng.uniform(-0.8e-3, 0.8e-3)
         times = np.linspace(0.0, min(settings.duration_s, 8.0), 41)
         best, most = None, -np.inf
@@ -321,4 +349,5 @@ class KneeSimulator:
             x, y, z = (float(value) for value in self.scene.ridge(rng.uniform(-0.0025, 0.0025))[0])
             opening = self.settings.gap or 0.0
             places.append((x, y + 0.0003, z - 0.0012) if lower else (x, y - 0.85 * opening, z - 0.0015))
-        return Probe(self.conditions.probe_visits, tuple(places), float(rng.choice([-1.0, 1.0])))
+        probe = Probe(self.conditions.probe_visits, tuple(places), float(rng.choice([-1.0, 1.0])))
+        return probe if self.look is None else self.look.with_instrument(probe)

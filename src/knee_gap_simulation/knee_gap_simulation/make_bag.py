@@ -13,21 +13,19 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.node.arguments import Parser, finite
 from knee_gap_core.user_files import flaw_of_new
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import inverse
+from knee_gap_simulation.bag_arguments import bag_parser
 from knee_gap_simulation.calibration.bag import (
-    BOARDS,
-    LENSES,
     CalibrationRecording,
     calibration_truth,
     make_calibration_bag,
 )
 from knee_gap_simulation.calibration.scene import RotatedScope
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.knee.difficulty import Difficulty
 from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator
+from knee_gap_simulation.looks.look import Appearance
 from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
     Sample,
@@ -42,7 +40,7 @@ from knee_gap_simulation.scope.clocks import image_times, stamp_ns, tracker_time
 from knee_gap_simulation.scope.hand_motion import HandMotion, TravelDirection
 from knee_gap_simulation.scope.imaging import Sensor, jpeg
 from knee_gap_simulation.scope.lens import Lens
-from knee_gap_simulation.scope.media import INDICES, Media, Medium, RefractedLens, index_of
+from knee_gap_simulation.scope.media import Media, Medium, RefractedLens
 from knee_gap_simulation.scope.tracker import track_lens, world_from_scene
 
 TURN_BEGIN_S = 0.5
@@ -245,94 +243,6 @@ class _Progress:
             print(f"rendering: {self._done} of {self._count} images", file=sys.stderr)
 
 
-def difficulty_argument(text: str) -> tuple[str, int]:
-    """A difficulty and its level from NAME=LEVEL. Raises argparse.ArgumentTypeError."""
-    name, _, level = text.partition("=")
-    if not level.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=LEVEL, such as debris=3")
-    try:
-        Difficulty.at(0, {name: int(level)})
-    except SimulationError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return name, int(level)
-
-
-def _parser() -> Parser:
-    defaults = Recording()
-    parser = Parser(
-        prog="make_bag",
-        description="Make a bag of a scene of known gap, seen by a tracked arthroscope: two rims, or with "
-        "--level a knee.",
-    )
-    parser.add_argument("out", type=Path, help="folder of the new bag")
-    parser.add_argument(
-        "--gap-mm",
-        type=finite,
-        help="distance between the rims (4); for a knee the smallest distance (drawn from 3-8)",
-    )
-    parser.add_argument(
-        "--depth-mm", type=finite, help="distance from the lens to the gap (10; for a knee drawn from 8-15)"
-    )
-    parser.add_argument("--travel-mm", type=finite, default=1e3 * defaults.travel, help="travel of the scope")
-    parser.add_argument("--seed", type=int, default=defaults.seed, help="the same seed gives the same bag")
-    parser.add_argument("--duration-s", type=finite, help="length of the recording (6; for a knee 4)")
-    parser.add_argument("--fps", type=finite, help="images per second (60; with --calibration 30)")
-    parser.add_argument("--quality", type=int, help="JPEG quality of the images of the rims, 1-100 (60)")
-    parser.add_argument("--level", type=int, choices=range(4), help="a knee of this difficulty")
-    parser.add_argument(
-        "--difficulty",
-        type=difficulty_argument,
-        action="append",
-        default=[],
-        metavar="NAME=LEVEL",
-        help=f"single difficulties of a knee: {', '.join(Difficulty.__dataclass_fields__)}",
-    )
-    parser.add_argument(
-        "--travel-direction", choices=[str(d) for d in TravelDirection], help="in a knee (along the gap)"
-    )
-    parser.add_argument("--no-gap", action="store_true", help="a closed knee, without a gap")
-    parser.add_argument("--calibration", action="store_true", help="record a board and pivoting to calibrate")
-    parser.add_argument(
-        "--video-delay-ms", type=finite, help="delay of the images' stamps (0; with --calibration 12)"
-    )
-    parser.add_argument("--board", choices=BOARDS, help="calibration board (charuco)")
-    parser.add_argument("--lens", choices=LENSES, help="lens to calibrate (equidistant)")
-    parser.add_argument(
-        "--turn-deg",
-        type=finite,
-        help="rotate that scope to and fro in its camera head, with a visible notch (no rotation, no notch)",
-    )
-    parser.add_argument(
-        "--scope-of", type=int, metavar="SEED", help="use the scope of the calibration bag of this seed"
-    )
-    parser.add_argument(
-        "--medium",
-        type=medium_argument,
-        help="medium in the joint (saline) or around the board (air): air, saline, water or an index",
-    )
-    parser.add_argument(
-        "--calibrated-in",
-        type=medium_argument,
-        metavar="MEDIUM",
-        help="medium in which the lens of camera_info was calibrated (the same; with --scope-of air)",
-    )
-    parser.add_argument(
-        "--portal-mm",
-        type=float,
-        help="pivot the scope about a portal this far behind its tip (default: a rotation of 2.5 deg)",
-    )
-    return parser
-
-
-def medium_argument(text: str) -> Medium:
-    """A medium by name or index. Raises argparse.ArgumentTypeError."""
-    try:
-        index = index_of(text)
-    except SimulationError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text if text in INDICES else index
-
-
 def _knee(arguments: argparse.Namespace) -> KneeSimulator:
     if arguments.quality is not None:
         raise SimulationError("--quality is for the rims; a knee's JPEG quality follows its noise level")
@@ -353,6 +263,7 @@ def _knee(arguments: argparse.Namespace) -> KneeSimulator:
         medium=arguments.medium or "saline",
         calibrated_in=arguments.calibrated_in,
         portal=_portal(arguments),
+        appearance=arguments.appearance or Appearance.PLAIN,
     )
 
 
@@ -387,10 +298,11 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
         arguments.travel_direction,
         arguments.calibrated_in,
         arguments.portal_mm,
+        arguments.appearance,
     )
     if arguments.no_gap or arguments.difficulty or any(value is not None for value in others):
         raise SimulationError(
-            "--calibration shows a board: gap, knee, depth, portal and medium of calibration do not apply"
+            "--calibration shows a board: a knee, its look, gap, depth and portal do not apply"
         )
     defaults = CalibrationRecording()
     delay_ms = 1e3 * defaults.video_delay if arguments.video_delay_ms is None else arguments.video_delay_ms
@@ -415,12 +327,12 @@ def _printed_times(times: Iterator[float], count: int) -> Iterator[float]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a bag; return 0 if it is written."""
-    arguments = _parser().parse_args(argv)
+    arguments = bag_parser().parse_args(argv)
     turned = arguments.turn_deg is not None
     of_rims = (
         turned or arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
     )
-    of_a_knee = arguments.difficulty or arguments.no_gap or arguments.travel_direction
+    of_a_knee = arguments.difficulty or arguments.no_gap or arguments.travel_direction or arguments.appearance
     try:
         if (arguments.board or arguments.lens) and not arguments.calibration:
             raise SimulationError("--board and --lens are for --calibration")

@@ -106,7 +106,7 @@ class CalibrationTruth:
         """Ground truth as plain numbers; transforms as translation [m] and quaternion."""
         shaft = self.scope.scope.body_to_shaft()
         return {
-            "lens": asdict(calibrated(self.lens)),
+            "lens": calibrated(self.lens).as_dict(),
             **({"index_ratio": self.lens.ratio} if isinstance(self.lens, RefractedLens) else {}),
             "T_body_lens": _plain(self.scope.body_to_lens(0.0)),
             "T_world_board": _plain(self.T_world_board),

@@ -53,13 +53,25 @@ class CameraHead:
     """Converts linear light to display images, frame by frame."""
 
     def __init__(
-        self, conditions: Conditions, stop: FloatImage, radius: npt.NDArray[np.float32], seed: int
+        self,
+        conditions: Conditions,
+        stop: FloatImage,
+        radius: npt.NDArray[np.float32],
+        seed: int,
+        *,
+        target: float = 0.50,
+        tone: ByteImage = _TONE,
+        sharpening: float = _SHARPENING,
     ) -> None:
-        """``stop`` (h, w) is the field stop, ``radius`` (h, w) the distance from its centre, 1 at its rim."""
+        """``stop`` (h, w) is the field stop, ``radius`` (h, w) the distance from its centre, 1 at its rim.
+
+        ``target`` is the mean display brightness, ``tone`` (4096,) the display values of light in [0, 2).
+        """
         self._conditions, self._seed = conditions, seed
         self._stop = stop
         self._vignette = (1.0 - conditions.vignette * np.clip(radius, 0.0, 1.0) ** 2.5).astype(np.float32)
-        self._exposure = AutoExposure(Sensor(target=0.50, settle_s=conditions.exposure_lag_s))
+        self._tone, self._sharpening = tone, sharpening
+        self._exposure = AutoExposure(Sensor(target=target, settle_s=conditions.exposure_lag_s))
 
     def develop(self, light: FloatImage, frame: int, step_s: float) -> ByteImage:
         """Display image (h, w, 3) bgr8 of linear light (h, w, 3)."""
@@ -80,9 +92,9 @@ class CameraHead:
             * np.sqrt(np.maximum(variance, 0.0))
             * (self._stop[..., None] > 0.0)
         )
-        display = _TONE[np.clip(exposed * 2048.0, 0.0, 4095.0).astype(np.uint16)]
+        display = self._tone[np.clip(exposed * 2048.0, 0.0, 4095.0).astype(np.uint16)]
         soft = cv2.GaussianBlur(display, (0, 0), 1.6)
-        return np.asarray(cv2.addWeighted(display, 1.0 + _SHARPENING, soft, -_SHARPENING, 0.0))
+        return np.asarray(cv2.addWeighted(display, 1.0 + self._sharpening, soft, -self._sharpening, 0.0))
 
 
 def _bloom(exposed: FloatImage) -> FloatImage:

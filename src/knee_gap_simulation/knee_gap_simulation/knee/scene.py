@@ -290,6 +290,10 @@ class KneeScene:
         sign = -1.0 if self.distance(point, CONDYLE)[0] < 0.0 else 1.0
         return sign * float(np.linalg.norm(point - foot)), point, foot
 
+    def opened(self) -> "KneeScene":
+        """The same knee with the condyle raised or lowered until the nearest distance is the gap."""
+        return self._opened_to(CLOSED if self.gap is None else self.gap)
+
     def _opened_to(self, gap: float) -> "KneeScene":
         """The same knee with the condyle raised or lowered until the nearest distance is ``gap``."""
         scene = self

@@ -139,7 +139,7 @@ class SceneTruth:
             "format": 1,
             "scene": self.scene.as_dict(),
             "T_world_scene": self.T_world_scene.tolist(),
-            "lens": asdict(calibrated(self.lens)),
+            "lens": calibrated(self.lens).as_dict(),
             "scope": asdict(self.scope),
             "T_body_lens": self.scope.body_to_lens().tolist(),
             **more,

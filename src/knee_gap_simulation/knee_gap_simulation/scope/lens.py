@@ -3,7 +3,8 @@
 It is independent of the perception's camera models, so that a mistake in those shows against the truth.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,8 @@ class Lens:
     """An equidistant lens: a bearing at the angle a from the axis falls focal_px * a from the centre.
 
     Frame: optical (z along the view, x right, y down). Pixel (0, 0) is the centre of the first pixel.
-    ``field_of_view`` is the full angle [rad] that passes the field stop; the image is black beyond it.
+    ``field_of_view`` is the full angle [rad] that passes the field stop; the image is black beyond it, and in
+    ``cut_top_px`` rows at its top and ``cut_bottom_px`` at its bottom.
     """
 
     width_px: int = 1280
@@ -26,6 +28,8 @@ class Lens:
     centre_x_px: float = 642.6
     centre_y_px: float = 357.8
     field_of_view: float = np.pi / 2.0
+    cut_top_px: float = 0.0
+    cut_bottom_px: float = 0.0
 
     def __post_init__(self) -> None:
         if self.width_px < 16 or self.height_px < 16:
@@ -49,7 +53,7 @@ class Lens:
         # sin(a) / r in a form that needs no special case at the centre.
         scale = np.sinc(angle / np.pi) / self.focal_px
         unit = np.stack([offset[..., 0] * scale, offset[..., 1] * scale, np.cos(angle)], axis=-1)
-        unit[~(angle <= self.field_of_view / 2.0)] = np.nan
+        unit[~(angle <= self.field_of_view / 2.0) | self._cut(offset[..., 1] + self.centre_y_px)] = np.nan
         return np.asarray(unit)
 
     def pixels(self, bearings: npt.ArrayLike) -> Array:
@@ -60,7 +64,7 @@ class Lens:
         with np.errstate(invalid="ignore", divide="ignore"):
             scale = np.where(across > 0.0, self.focal_px * angle / across, 0.0)
         pixel = direction[..., :2] * scale[..., None] + (self.centre_x_px, self.centre_y_px)
-        pixel[~(angle <= self.field_of_view / 2.0)] = np.nan
+        pixel[~(angle <= self.field_of_view / 2.0) | self._cut(pixel[..., 1])] = np.nan
         return np.asarray(pixel)
 
     def pixel_grid(self) -> Array:
@@ -74,4 +78,19 @@ class Lens:
         """Fraction (height, width) of the light that passes the stop: 1 inside, 0 outside, soft between."""
         offset = self.pixel_grid() - (self.centre_x_px, self.centre_y_px)
         inside = (self.radius_px - np.hypot(offset[..., 0], offset[..., 1])) / softness_px
+        inside[self._cut(np.arange(self.height_px, dtype=float))] = 0.0
         return np.clip(inside, 0.0, 1.0).astype(np.float32)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The lens as plain values for JSON; cuts only if there are any."""
+        values = asdict(self)
+        return {
+            name: value for name, value in values.items() if not (name.startswith("cut") and value == 0.0)
+        }
+
+    def _cut(self, rows_px: Array) -> npt.NDArray[np.bool_]:
+        """Whether rows (...) [px] lie in the cut parts of the image."""
+        if self.cut_top_px == 0.0 and self.cut_bottom_px == 0.0:
+            return np.zeros(rows_px.shape, bool)
+        last = self.height_px - self.cut_bottom_px - 0.5
+        return np.asarray((rows_px < self.cut_top_px - 0.5) | (rows_px > last))

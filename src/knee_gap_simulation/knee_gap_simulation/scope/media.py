@@ -71,6 +71,8 @@ class RefractedLens(Lens):
             centre_x_px=inner.centre_x_px,
             centre_y_px=inner.centre_y_px,
             field_of_view=2.0 * float(np.arcsin(side)),
+            cut_top_px=inner.cut_top_px,
+            cut_bottom_px=inner.cut_bottom_px,
             inner=inner,
             ratio=ratio,
         )
