@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_bringup.simulated_calibration import simulated_calibration
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.values.arrays import Array
 from knee_gap_perception.calibration.calibration_file import save_calibration
 from knee_gap_replay import process
+from knee_gap_replay.report.comparison import Comparison, compare
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
 

@@ -15,13 +15,13 @@ from endoscope_images import RIGID_ENDOSCOPE, EndoscopeFrames, rigid_endoscope
 from motive_takes import THREE_BODIES, three_body_take
 from recordings import origins
 
-from knee_gap_bringup.comparison import EDGES, GAP
 from knee_gap_bringup.demo import play_through_nodes
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.stamps import set_stamp
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_perception.trackers.motive_csv import read_take
+from knee_gap_replay.report.comparison import EDGES, GAP
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
 ROOT = Path(__file__).parents[2]

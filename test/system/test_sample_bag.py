@@ -14,10 +14,10 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from sample_bag import SAMPLE
 
-from knee_gap_bringup.comparison import Comparison, compare
 from knee_gap_bringup.launching.processes import executable
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.stamps import stamp_ns
+from knee_gap_replay.report.comparison import Comparison, compare
 
 ROOT = Path(__file__).parents[2]
 EDGES, GAP = "/knee_gap/gap_edges", "/knee_gap/gap"

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from knee_gap_bringup.comparison import EDGES, GAP, compare
 from knee_gap_bringup.gap_plot import write_gap_plot
 from knee_gap_bringup.launching.plan import DRAIN, NODES
 from knee_gap_bringup.launching.processes import Processes, StartError, executable
@@ -15,6 +14,7 @@ from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_replay.report.comparison import EDGES, GAP, compare
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from knee_gap_bringup.comparison import Comparison
+from knee_gap_replay.report.comparison import Comparison
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # the backend must be chosen first

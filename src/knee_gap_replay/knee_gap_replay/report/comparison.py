@@ -120,7 +120,7 @@ def compare(recording: Path, output: Path) -> Comparison:
 
     Raises BagError for a bag that cannot be read and SimulationError for one that is not simulated.
     """
-    truths = _Truths(recording, output)
+    truths = Truths(recording, output)
     columns: dict[str, list[float]] = {entry.name: [] for entry in fields(Comparison) if entry.name != "time"}
     stamps: list[int] = []
     with BagReader(output) as bag:
@@ -141,10 +141,13 @@ def compare(recording: Path, output: Path) -> Comparison:
     return Comparison(time=time, valid=valid, **arrays)
 
 
-class _Truths:
-    """Ground truth of a recording at the stamps of its images, for the points and sections of an output."""
+class Truths:
+    """Ground truth of a recording at the stamps of its images, for the points and sections of an output.
 
-    def __init__(self, recording: Path, output: Path) -> None:
+    Raises BagError for a bag that cannot be read and SimulationError for a recording that is not simulated.
+    """
+
+    def __init__(self, recording: Path, output: Path, edges_topic: str = EDGES) -> None:
         with BagReader(recording) as bag:
             self._scene = scene_from_metadata(bag.metadata)
             self._poses: dict[int, Array] = {}
@@ -155,7 +158,7 @@ class _Truths:
         self._points: dict[int, float] = {}
         self._gaps: dict[int, float] = {}
         with BagReader(output) as bag:
-            for entry in bag.messages([EDGES]):
+            for entry in bag.messages([edges_topic]):
                 edges = bag.deserialize(entry)
                 stamp = stamp_ns(edges.header)
                 if not edges.track_id or stamp not in self._poses:
