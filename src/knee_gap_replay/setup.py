@@ -5,7 +5,7 @@ NAME = "knee_gap_replay"
 setup(
     name=NAME,
     version="0.1.0",
-    description="Commands on bags of knee_gap: play, record, process, check, evaluate, import_motive.",
+    description="Commands on bags of knee_gap: play, record, process, check, report, evaluate.",
     license="Apache-2.0",
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",
@@ -24,6 +24,7 @@ setup(
             "play = knee_gap_replay.entry_points:play",
             "process = knee_gap_replay.entry_points:process",
             "record = knee_gap_replay.entry_points:record",
+            "report = knee_gap_replay.entry_points:report",
         ],
     },
 )
