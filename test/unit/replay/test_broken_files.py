@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -28,6 +29,7 @@ SCOPE = (
     "/**/tracking_node:\n  ros__parameters:\n    body_to_shaft_translation: [0.0, 0.0, 0.2]\n"
     "    body_to_shaft_quaternion_xyzw: [0.0, 0.0, 0.0, 1.0]\n    translation_error: 1.0e-4\n"
 )
+PICTURE = cv2.imencode(".jpg", np.full((64, 64, 3), 90, np.uint8))[1].tobytes()
 CUTS, FLIPS = 12, 24
 # Of one run on a machine that is busy otherwise [s of this process].
 MOST_SECONDS = 20.0
@@ -36,7 +38,7 @@ Run = Callable[[Path], int]
 
 
 def write_bag(path: Path) -> Path:
-    """Empty images at 50 Hz and poses at 100 Hz, in several chunks, and parameters."""
+    """Small grey images at 50 Hz and poses at 100 Hz, in several chunks, and parameters."""
     with BagWriter(path, metadata={"take": "none"}) as bag:
         for topic, msgtype in (
             (IMAGE, "sensor_msgs/msg/CompressedImage"),
@@ -53,6 +55,8 @@ def write_bag(path: Path) -> Path:
                 message.header.stamp.nanosec = stamp_ms * 1_000_000
                 if topic == POSE:
                     message.pose.position.x = 1e-3 * np.sin(stamp_ms)
+                if topic == IMAGE:
+                    message.format, message.data = "jpeg", np.frombuffer(PICTURE, np.uint8)
                 bag.write(topic, message, (stamp_ms + 5) * 1_000_000)
             if stamp_ms % 100 == 90:
                 bag.flush()
@@ -143,7 +147,8 @@ def judge(run: Run, place: Path, what: str, capsys: pytest.CaptureFixture[str]) 
         said = (printed.err or printed.out).strip().splitlines()
         errors = [line for line in printed.err.splitlines() if "%" not in line]  # but progress
         assert said, f"{what}: nothing was said"
-        assert "not usable" in printed.out or len(errors) == 1, f"{what}: {printed.err}"
+        answered = "not usable" in printed.out or "could be read: " in printed.out
+        assert answered or len(errors) == 1, f"{what}: {printed.err}"
     return code
 
 
