@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import mcap_doctor
 import numpy as np
 import pytest
 
@@ -172,6 +173,28 @@ def test_a_loop_begins_again_with_the_stamps_and_clock_of_the_bag(bag: Path, pro
     assert max(ticks) < 2_000_000_000
 
 
+def test_a_part_under_another_name_is_recorded_in_split_and_packed_files(
+    bag: Path, tmp_path: Path, processes: Processes
+) -> None:
+    out = tmp_path / "out"
+    command = [executable("knee_gap_replay", "record"), str(out), "--all", "--compression", "zstd"]
+    processes.start("record", [*command, "--max-bag-duration", "0.4"])
+    part = ["--start-offset", "0.5", "--playback-duration", "1", "--remap", f"{POSE}:=/other/pose"]
+    # Discovered while it waits: no topic is asked for by name.
+    play(processes, bag, *part, "--delay", "3", "--topics", POSE, INFO)
+    assert processes.wait("play") == 0, processes.last_words("play")
+    assert processes.end("record") == 0, processes.last_words("record")
+    kept, expected = contents(out), contents(bag)
+    assert kept["/other/pose"] == expected[POSE][60:180]
+    assert kept[INFO] == expected[INFO]
+    assert "121 messages of 2 topics" in processes.last_words("play")
+    files = sorted(out.glob("*.mcap"))
+    assert [file.name for file in files] == [f"out_{index}.mcap" for index in range(len(files))]
+    assert len(files) >= 3
+    for file in files:
+        mcap_doctor.examine(file)
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "reason"),
     [
@@ -184,7 +207,11 @@ def test_a_loop_begins_again_with_the_stamps_and_clock_of_the_bag(bag: Path, pro
         ("play", ["{bag}", "--wait-for", "/pose", "--wait-timeout", "0.3"], "no subscriber to /pose"),
         ("play", ["{bag}", "--ros-args", "-p", "speed:=2"], "no parameter speed"),
         ("play", ["{bag}", "--ros-args", "--nonsense"], "--nonsense"),
+        ("play", ["{bag}", "--remap", "/gap:=/other"], "has no topic /gap"),
+        ("play", ["{bag}", "--remap", "/pose"], "takes FROM:=TO"),
         ("record", ["{bag}", "/pose"], "exists already"),
+        ("record", ["{none}", "/pose", "--max-bag-size", "12"], "at least 1000000 bytes"),
+        ("record", ["{none}", "/pose", "--compression", "rar"], "--compression"),
         ("record", ["{none}"], "required: TOPIC"),
         ("record", ["{none}", "/pose", "--duration", "-1"], "--duration"),
         ("record", ["{none}", "not a topic"], "not a topic"),

@@ -5,7 +5,8 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Collection, Sequence
+from array import array
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import rclpy
 from rclpy.clock import ClockType
@@ -16,10 +17,11 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from rclpy.utilities import remove_ros_args
+from rosbags.interfaces import QosReliability
 from rosgraph_msgs.msg import Clock
 
 from knee_gap_core.bag import qos as qos_profiles
-from knee_gap_core.bag.bag import BagReader, Topic
+from knee_gap_core.bag.bag import BagMessage, BagReader, Topic
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import check_type_hash, message_class
 from knee_gap_core.node.base_node import GuardedNode
@@ -31,8 +33,19 @@ from knee_gap_core.node.command_line import (
     stop_on_signals,
     with_progress,
 )
+from knee_gap_core.node.keyboard import keys
 from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
-from knee_gap_replay.playback import Event, Pace, Played, play_once, with_clock, without_clock
+from knee_gap_replay.playback import (
+    Controls,
+    Event,
+    Pace,
+    Played,
+    play_once,
+    read_ahead,
+    window,
+    with_clock,
+    without_clock,
+)
 
 _LOG = logging.getLogger(__name__)
 # Two seconds of a tracker, four of images: how far a reliable subscriber may fall behind without loss. The
@@ -45,11 +58,21 @@ _ACKNOWLEDGE_SECONDS = 2.0
 class PlayNode(GuardedNode):
     """Publishers for the topics of a bag. Topics of unknown types are skipped with one line each."""
 
-    def __init__(self, reader: BagReader, topics: Collection[str], *, clock: bool) -> None:
+    def __init__(
+        self,
+        reader: BagReader,
+        topics: Collection[str],
+        *,
+        clock: bool,
+        remap: Mapping[str, str] | None = None,
+        recorded_qos: bool = False,
+    ) -> None:
         with refused_by_ros():
             super().__init__("play")
         refuse_unknown(self)
         self._publishers_by_topic: dict[str, Publisher] = {}
+        self._remap = dict(remap or {})
+        self._recorded_qos = recorded_qos
         for name in sorted(topics):
             try:
                 self._publishers_by_topic[name] = self._publisher(name, reader.details[name])
@@ -94,7 +117,8 @@ class PlayNode(GuardedNode):
             raise BagError(f"it is serialised as '{topic.encoding}', not cdr")
         check_type_hash(topic.msgtype, topic.type_hash)
         try:
-            return self.create_publisher(message_class(topic.msgtype), name, _offered(topic))
+            qos = _recorded(topic) if self._recorded_qos else _offered(topic)
+            return self.create_publisher(message_class(topic.msgtype), self._remap.get(name, name), qos)
         except InvalidTopicNameException as error:
             raise BagError(str(error).partition("\n")[0]) from None
 
@@ -110,20 +134,68 @@ def _offered(topic: Topic) -> QoSProfile:
     )
 
 
-def _play(node: PlayNode, reader: BagReader, arguments: argparse.Namespace, stop: threading.Event) -> Played:
+def _recorded(topic: Topic) -> QoSProfile:
+    """Return the quality of service that the bag says; that of `_offered` where it says none."""
+    if not topic.qos:
+        return _offered(topic)
+    reliable = all(qos.reliability == QosReliability.RELIABLE for qos in topic.qos)
+    latched = qos_profiles.is_latched(topic.qos)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=max(1, *(qos.depth for qos in topic.qos)),
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _messages(node: PlayNode, reader: BagReader, arguments: argparse.Namespace) -> Iterator[BagMessage]:
+    """Return the messages of the part of the bag that is to be played."""
+    messages = reader.messages(node.topics)
+    if not arguments.start_offset and arguments.playback_duration is None:
+        return messages
+    begin_ns = reader.start_ns + round(arguments.start_offset * 1e9)
+    end_ns = None
+    if arguments.playback_duration is not None:
+        end_ns = begin_ns + round(arguments.playback_duration * 1e9)
+    latched = [name for name in node.topics if qos_profiles.is_latched(reader.details[name].qos)]
+    return window(messages, begin_ns, end_ns, latched)
+
+
+def _play(
+    node: PlayNode,
+    reader: BagReader,
+    arguments: argparse.Namespace,
+    stop: threading.Event,
+    controls: Controls,
+) -> Played:
     """Play once, or in a loop until stopped."""
     begin_ns = time.monotonic_ns()
-    count = latest_ns = 0
+    late_ns = array("q")
+    is_part = arguments.start_offset or arguments.playback_duration is not None
+    total = None if is_part else reader.count(node.topics)
     while True:
-        messages = with_progress(reader.messages(node.topics), reader.count(node.topics))
+        ahead = read_ahead(_messages(node, reader, arguments), stop)
+        messages = with_progress(ahead, total, lambda message: message.time_ns)
         events = with_clock(messages) if arguments.clock else without_clock(messages)
         pace = Pace(begin_ns, arguments.rate)
-        played = play_once(events, pace, node.emit, time.monotonic_ns, stop.wait)
-        count += played.message_count
-        latest_ns = max(latest_ns, played.latest_ns)
+        played = play_once(events, pace, node.emit, time.monotonic_ns, stop.wait, controls)
+        late_ns += played.late_ns
         if stop.is_set() or not arguments.loop or not played.message_count:
-            return Played(count, latest_ns, played.end_ns)
+            return Played(len(late_ns), max(late_ns, default=0), played.end_ns, late_ns)
         begin_ns = played.end_ns
+
+
+def _remapped(pairs: Sequence[str], topics: Collection[str]) -> dict[str, str]:
+    """Return the new names of topics from FROM:=TO. Raises BagError."""
+    remap: dict[str, str] = {}
+    for pair in pairs:
+        name, sign, new = pair.partition(":=")
+        if not sign or not name or not new:
+            raise BagError(f"--remap takes FROM:=TO, not '{pair}'")
+        if name not in topics:
+            raise BagError(f"--remap {pair}: the bag has no topic {name}; it has {', '.join(sorted(topics))}")
+        remap[name] = new
+    return remap
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -133,21 +205,27 @@ def _run(arguments: argparse.Namespace) -> int:
         chosen = frozenset(arguments.topics or reader.topics)
         reader.messages([*chosen, *arguments.wait_for])  # raises for a topic that is not in the bag
         stop = stop_on_signals()
-        node = PlayNode(reader, chosen, clock=arguments.clock)
+        remap = _remapped(arguments.remap, reader.topics)
+        recorded = arguments.qos == "recorded"
+        node = PlayNode(reader, chosen, clock=arguments.clock, remap=remap, recorded_qos=recorded)
+        controls = Controls(paused=arguments.start_paused)
         try:
             if unplayed := sorted(set(arguments.wait_for) - set(node.topics)):
                 raise BagError(f"--wait-for {', '.join(unplayed)}: not played")
             node.wait_for_subscribers(arguments.wait_for, arguments.wait_timeout, stop)
             begin = time.monotonic()
-            if not stop.wait(arguments.delay):
-                played = _play(node, reader, arguments, stop)
-                seconds = time.monotonic() - begin - arguments.delay
-                print(
-                    f"play: {played.message_count} messages of {len(node.topics)} topics in {seconds:.1f} s, "
-                    f"at most {played.latest_ns * 1e-6:.1f} ms late",
-                    flush=True,
-                )
-                node.flush()
+            with keys(controls.press) as heard:
+                if heard:
+                    print("play: space pauses, n plays one message, up and down change the rate", flush=True)
+                if not stop.wait(arguments.delay):
+                    played = _play(node, reader, arguments, stop, controls)
+                    seconds = time.monotonic() - begin - arguments.delay
+                    print(
+                        f"play: {played.message_count} messages of {len(node.topics)} topics in "
+                        f"{seconds:.1f} s, {played.late_words()}",
+                        flush=True,
+                    )
+                    node.flush()
         finally:
             node.destroy_node()
     return 0
@@ -163,6 +241,25 @@ def _parser() -> Parser:
     parser.add_argument("--clock", action="store_true", help="publish the bag's time on /clock, at 100 Hz")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these topics")
     parser.add_argument(
+        "--start-offset", type=not_negative, default=0.0, metavar="SECONDS", help="begin so late in the bag"
+    )
+    parser.add_argument(
+        "--playback-duration", type=positive, metavar="SECONDS", help="play only so much of the bag"
+    )
+    parser.add_argument(
+        "--start-paused", action="store_true", help="begin paused; needs a terminal for the keys"
+    )
+    parser.add_argument(
+        "--remap", nargs="+", default=[], metavar="FROM:=TO", help="publish topics under other names"
+    )
+    parser.add_argument(
+        "--qos",
+        choices=("reliable", "recorded"),
+        default="reliable",
+        help="offer reliable topics, which suit every subscriber, or what the bag says; latched topics are "
+        "always those of the bag",
+    )
+    parser.add_argument(
         "--delay", type=not_negative, default=0.0, metavar="SECONDS", help="wait before the first message"
     )
     parser.add_argument(
@@ -177,14 +274,17 @@ def _parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Play a bag; takes ROS arguments (--ros-args) like any node."""
     given = list(sys.argv[1:] if argv is None else argv)
+    # FROM:=TO of --remap is not for rclpy, which would take it for a rule of its own.
+    begin = given.index("--ros-args") if "--ros-args" in given else len(given)
+    own, ros = given[:begin], given[begin:]
     try:
-        require_files(given)
-        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+        require_files(ros)
+        rclpy.init(args=ros, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy's own exceptions for wrong ROS arguments are not public
         print(f"play: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
     try:
-        return run(_parser(), _run, remove_ros_args(["play", *given])[1:])
+        return run(_parser(), _run, [*own, *remove_ros_args(["play", *ros])[1:]])
     finally:
         rclpy.try_shutdown()
 

@@ -24,6 +24,8 @@ from knee_gap_core.bag.bag import BagMessage, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import known_type, message_class
 from knee_gap_core.bag.qos import PROFILES
+from knee_gap_core.bag.writing.bag_writer import Split
+from knee_gap_core.bag.writing.mcap_storage import COMPRESSIONS
 from knee_gap_core.node.base_node import GuardedNode
 from knee_gap_core.node.command_line import Parser, positive, run, stop_on_signals
 from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
@@ -34,18 +36,25 @@ _LOG = logging.getLogger(__name__)
 # One second of a tracker at 240 Hz, four of images: how long the recorder may be stalled on a busy machine.
 _DEPTH = 256
 _LOOK_SECONDS = 0.02
+# How far messages of two topics may arrive out of the order of their times [ns].
+_SPAN_NS = 200_000_000
+_LEAST_FILE_BYTES = 1_000_000
 
 
 class RecordNode(GuardedNode):
     """Subscribes to each topic once it is published, with the quality of service of its weakest publisher."""
 
-    def __init__(self, topics: Sequence[str], writer: WriterThread) -> None:
+    def __init__(self, topics: Sequence[str], writer: WriterThread, *, every: bool = False) -> None:
         with refused_by_ros():
             super().__init__("record")
         refuse_unknown(self)
         self._writer = writer
         self._wanted = [self._resolved(topic) for topic in dict.fromkeys(topics)]
+        self._asked_for = tuple(self._wanted)
+        self._every = every
         self._refused: set[str] = set()
+        # Added to times of receipt, so that they run on where the clock is set back (a loop of a bag).
+        self._shift_ns = self._newest_ns = 0
         self._subscriptions_by_topic: dict[str, Subscription] = {}
         self._profiles: dict[str, QoSProfile] = {}
         self._last_numbers: dict[str, int] = {}
@@ -55,11 +64,15 @@ class RecordNode(GuardedNode):
 
     @property
     def silent_topics(self) -> list[str]:
-        """Topics without a publisher so far."""
-        return [topic for topic in self._wanted if topic not in self._last_numbers]
+        """Topics that were asked for and without a message so far."""
+        return [topic for topic in self._asked_for if topic not in self._last_numbers]
 
     def look_for_publishers(self) -> None:
         """Subscribe to new topics; subscribe again if a new publisher offers a weaker quality of service."""
+        if self._every:
+            wanted = set(self._wanted)
+            names = sorted(name for name, _ in self.get_topic_names_and_types() if "/_" not in name)
+            self._wanted += [name for name in names if name not in wanted]
         for topic in self._wanted:
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers or topic in self._refused:
@@ -97,9 +110,12 @@ class RecordNode(GuardedNode):
         self._count_lost(topic, info.get("publication_sequence_number"))
         received = info.get("received_timestamp")
         clock = self.get_clock()
+        now_ns = clock.now().nanoseconds
         if received is None or (isinstance(clock, ROSClock) and clock.ros_time_is_active):
-            received = clock.now().nanoseconds
-        self._writer.put(BagMessage(topic, msgtype, received, data))
+            received = now_ns
+        self._shift_ns += max(0, self._newest_ns - now_ns)
+        self._newest_ns = now_ns
+        self._writer.put(BagMessage(topic, msgtype, received + self._shift_ns, data))
 
     def _count_lost(self, topic: str, number: int | None) -> None:
         """Count missing sequence numbers of a topic's only publisher; each publisher has its own sequence."""
@@ -135,10 +151,20 @@ def _offered(publisher: TopicEndpointInfo) -> Qos:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if not arguments.topics and not arguments.all:
+        raise BagError("the following arguments are required: TOPIC, or --all")
     stop = stop_on_signals()
-    bag = BagWriter(arguments.out, replace=arguments.force)
+    duration = arguments.max_bag_duration
+    split = Split(arguments.max_bag_size, None if duration is None else round(duration * 1e9))
+    bag = BagWriter(
+        arguments.out,
+        compression=arguments.compression,
+        split=split,
+        span_ns=_SPAN_NS,
+        replace=arguments.force,
+    )
     writer = WriterThread(bag)
-    node = RecordNode(arguments.topics, writer)
+    node = RecordNode(arguments.topics, writer, every=arguments.all)
     with bag:
         writer.start()
         executor = SingleThreadedExecutor()
@@ -168,12 +194,31 @@ def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) ->
     return 1 if lost or node.seam.counts else 0
 
 
+def _size(text: str) -> int:
+    if not text.isdecimal() or int(text) < _LEAST_FILE_BYTES:
+        raise argparse.ArgumentTypeError(f"must be at least {_LEAST_FILE_BYTES} bytes, not '{text}'")
+    return int(text)
+
+
 def _parser() -> Parser:
     parser = Parser(prog="record", description=__doc__)
     parser.add_argument("out", metavar="OUT", help="the bag to write")
     add_force_argument(parser)
     parser.add_argument(
-        "topics", nargs="+", metavar="TOPIC", help="topics to record, once they are published"
+        "topics",
+        nargs="*",
+        metavar="TOPIC",
+        help="topics to record, once they are published",
+    )
+    parser.add_argument("--all", action="store_true", help="record every topic, as it appears")
+    parser.add_argument(
+        "--compression", choices=tuple(COMPRESSIONS), default="none", help="of the chunks (none)"
+    )
+    parser.add_argument(
+        "--max-bag-size", type=_size, metavar="BYTES", help="begin a new file before one grows larger"
+    )
+    parser.add_argument(
+        "--max-bag-duration", type=positive, metavar="SECONDS", help="begin a new file after this time"
     )
     parser.add_argument("--duration", type=positive, metavar="SECONDS", help="stop after this time")
     return parser

@@ -1,5 +1,6 @@
 """Bag writer in a thread of its own, so that a slow disk does not delay the receiving thread."""
 
+import logging
 import queue
 import threading
 import time
@@ -9,7 +10,9 @@ from collections.abc import Sequence
 from rosbags.interfaces import Qos
 
 from knee_gap_core.bag.bag import BagMessage, BagWriter
+from knee_gap_core.bag.errors import DiskFullError
 
+_LOG = logging.getLogger(__name__)
 # Most data that is lost if the recorder is killed.
 _FLUSH_SECONDS = 0.5
 # Some seconds of raw video.
@@ -19,7 +22,8 @@ _MEMORY_BYTES = 512 * 1024 * 1024
 class WriterThread(threading.Thread):
     """Queues messages without blocking and writes them in the order of arrival.
 
-    A message that arrives while the queue is full is dropped and counted in `dropped`. A failure to write
+    A message that arrives while the queue is full is dropped and counted in `dropped`. On a full disk
+    messages are kept in memory, within the same limit, until there is space again. Any other failure to write
     ends the thread and is kept in `error`.
     """
 
@@ -30,6 +34,9 @@ class WriterThread(threading.Thread):
         self._bag = bag
         self._memory_bytes = memory_bytes
         self._put_bytes = self._written_bytes = 0
+        # What the disk has no space for, and whether it has been said.
+        self._waiting_bytes = 0
+        self._full = False
         self._queue: queue.SimpleQueue[BagMessage | tuple[str, str, Sequence[Qos]] | None] = (
             queue.SimpleQueue()
         )
@@ -40,7 +47,10 @@ class WriterThread(threading.Thread):
 
     def put(self, message: BagMessage) -> None:
         """Queue a message; returns at once."""
-        if self._put_bytes - self._written_bytes + len(message.data) > self._memory_bytes:
+        if (
+            self._put_bytes - self._written_bytes + self._waiting_bytes + len(message.data)
+            > self._memory_bytes
+        ):
             self.dropped[message.topic] += 1
             return
         self._put_bytes += len(message.data)
@@ -61,17 +71,31 @@ class WriterThread(threading.Thread):
     def _write(self) -> None:
         flushed = time.monotonic()
         while True:
+            idle = False
             try:
                 item = self._queue.get(timeout=_FLUSH_SECONDS)
             except queue.Empty:
-                item = ("", "", ())
+                item, idle = ("", "", ()), True
             if item is None:
                 return
-            if isinstance(item, BagMessage):
-                self._bag.write_raw(item.topic, item.data, item.time_ns)
-                self._written_bytes += len(item.data)
-            elif item[0]:
-                self._bag.add_topic(*item)
-            if time.monotonic() - flushed > _FLUSH_SECONDS:
-                self._bag.flush()
-                flushed = time.monotonic()
+            try:
+                self._take(item)
+                if time.monotonic() - flushed > _FLUSH_SECONDS:
+                    flushed = time.monotonic()
+                    # While nothing arrives, nothing can come before what waits for its turn.
+                    self._bag.flush(drain=idle)
+                    if self._full:
+                        self._full = False
+                        _LOG.warning("there is space again; recording goes on")
+            except DiskFullError as error:
+                if not self._full:
+                    self._full = True
+                    _LOG.warning("%s; recording goes on in memory until there is space", error)
+            self._waiting_bytes = self._bag.pending_bytes
+
+    def _take(self, item: BagMessage | tuple[str, str, Sequence[Qos]]) -> None:
+        if isinstance(item, BagMessage):
+            self._written_bytes += len(item.data)
+            self._bag.write_raw(item.topic, item.data, item.time_ns)
+        elif item[0]:
+            self._bag.add_topic(*item)

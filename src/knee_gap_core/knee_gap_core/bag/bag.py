@@ -103,6 +103,11 @@ class BagReader:
         return sum(count[topic] for count in counts if count is not None for topic in recorded)
 
     @property
+    def start_ns(self) -> int:
+        """Time of the first message, 0 without any."""
+        return min((block.start_ns for file in self._files for block in file.blocks), default=0)
+
+    @property
     def renamed(self) -> str:
         """One line with the former names that are read under those of today; empty if there are none."""
         pairs = [f"{former} is {today}" for today, former in self._recorded.items() if former != today]
