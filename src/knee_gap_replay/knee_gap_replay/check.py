@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.command_line import Parser, run
 from knee_gap_replay.bag_check import TopicCheck, check_topics, reasons_against
-from knee_gap_replay.topics import add_topic_arguments, topics_from
+from knee_gap_replay.topics import add_topic_arguments, choices, topics_from
 from knee_gap_replay.whole_bags.output import add_force_argument
 from knee_gap_replay.whole_bags.recovery import recover
 
@@ -19,20 +19,22 @@ def _line(check: TopicCheck, width: int) -> str:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    with BagReader(arguments.bag) as reader:
+    with BagReader(arguments.bag, salvage=arguments.recover is not None) as reader:
         if reader.renamed:
             print(reader.renamed)
         checks = check_topics(reader)
         width = max((len(name) for name in checks), default=0)
         for check in checks.values():
             print(_line(check, width))
-        reasons = reasons_against(checks, topics_from(arguments, reader.topics))
         losses = len(reader.losses)
-    print(f"{losses} damaged or missing parts" if losses else "complete and undamaged")
-    if arguments.recover is not None:
-        saved = recover(arguments.bag, arguments.recover, replace=arguments.force)
-        print(f"{saved.message_count} messages of {saved.topic_count} topics saved in {arguments.recover}")
-        return 0
+        print(f"{losses} damaged or missing parts" if losses else "complete and undamaged")
+        if arguments.recover is not None:
+            saved = recover(reader, arguments.recover, replace=arguments.force)
+            count = f"{saved.message_count} messages of {saved.topic_count} topics"
+            print(f"{count} saved in {arguments.recover}")
+            return 0
+        reasons = reasons_against(checks, topics_from(arguments, reader.topics))
+        reasons += [hint] if (hint := choices(reader.topics, topics_from(arguments, reader.topics))) else []
     print("not usable: " + "; ".join(reasons) if reasons else "usable")
     return 1 if reasons else 0
 

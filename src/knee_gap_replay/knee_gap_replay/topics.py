@@ -1,7 +1,7 @@
 """Names of knee_gap's input topics in a bag, and the command line arguments that set them."""
 
 import argparse
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 
@@ -34,6 +34,19 @@ def topics_from(arguments: argparse.Namespace, available: Collection[str]) -> In
         camera_info=arguments.camera_info or f"{space}/camera_info",
         body_pose=arguments.pose or f"{space}/scope_body/pose",
     )
+
+
+def choices(available: Mapping[str, str], topics: InputTopics) -> str:
+    """Return the option for each missing input and the topics (name: type) that may be meant by it."""
+    words = []
+    for name, option, types in (
+        (topics.image, "--image", ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")),
+        (topics.camera_info, "--camera-info", ("sensor_msgs/msg/CameraInfo",)),
+        (topics.body_pose, "--pose", ("geometry_msgs/msg/PoseStamped",)),
+    ):
+        if name not in available and (found := sorted(n for n, kind in available.items() if kind in types)):
+            words.append(f"{option} {' or '.join(found)}")
+    return f"choose with {', '.join(words)}" if words else ""
 
 
 def namespace_from(arguments: argparse.Namespace) -> str:

@@ -12,7 +12,7 @@ from ros_bags import MADE_BAGS
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.stamps import set_stamp
-from knee_gap_replay import check
+from knee_gap_replay import check, process
 
 POSE = "geometry_msgs/msg/PoseStamped"
 MS, YEAR_NS = 1_000_000, 31_536_000 * 10**9
@@ -153,3 +153,21 @@ def test_foreign_channels_and_empty_messages_are_told_in_a_line(
     with BagReader(path) as first, BagReader(tmp_path / "out") as second:
         assert sorted(first.messages()) == sorted(second.messages())
         assert first.details["/proto"].definition_bytes == second.details["/proto"].definition_bytes
+
+
+def test_of_two_cameras_in_a_bag_the_choice_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        for side in ("left", "right"):
+            bag.add_topic(f"/{side}/image", "sensor_msgs/msg/Image")
+        bag.add_topic("/rigid/pose", POSE)
+        bag.write("/rigid/pose", blank(POSE), 1)
+    hint = "choose with --image /left/image or /right/image, --pose /rigid/pose"
+    assert check.main([str(tmp_path / "bag")]) == 1
+    assert capsys.readouterr().out.splitlines()[-1].endswith(hint)
+    assert process.main([str(tmp_path / "bag"), str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.strip().endswith(hint)
+    assert not (tmp_path / "out").exists()

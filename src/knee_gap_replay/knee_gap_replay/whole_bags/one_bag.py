@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
+from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
-from knee_gap_replay.topics import topics_from
+from knee_gap_replay.topics import choices, topics_from
 from knee_gap_replay.whole_bags.output import refuse_input_as_output
 from knee_gap_replay.whole_bags.overlapped import process_overlapped, usable_cores
 
@@ -46,6 +47,10 @@ def process_one(job: Job, workers: int | None = None) -> Result:
         image, camera_info, pose = job.topics
         named = argparse.Namespace(namespace=job.namespace, image=image, camera_info=camera_info, pose=pose)
         topics = topics_from(named, reader.topics)
+        if missing := [topic for topic in topics if topic not in reader.topics]:
+            names = ", ".join(sorted(reader.topics)) or "none"
+            hint = f"; {hint}" if (hint := choices(reader.topics, topics)) else ""
+            raise BagError(f"{reader.path} has no topic {', '.join(missing)}; it has {names}{hint}")
         pipeline = GapPipeline.from_parameters(
             _parameters(job), topics, job.namespace, with_mask=job.with_mask
         )

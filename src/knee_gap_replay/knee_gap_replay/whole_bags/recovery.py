@@ -16,28 +16,27 @@ class Recovered(NamedTuple):
     losses: tuple[str, ...]
 
 
-def recover(bag: str, out: str, *, replace: bool = False) -> Recovered:
+def recover(reader: BagReader, out: str, *, replace: bool = False) -> Recovered:
     """Copy every complete message of a bag, byte for byte and under its recorded name.
 
-    Raises BagError if nothing can be read, before anything is written.
+    `reader` is one that salvages. Raises BagError if nothing can be read, before anything is written.
     """
-    refuse_input_as_output(bag, out)
-    with BagReader(bag, salvage=True) as reader:
-        messages = reader.messages()
-        if (first := next(messages, None)) is None:
-            raise BagError(f"{bag} holds no message that can be read")
-        with BagWriter(out, metadata=reader.metadata, replace=replace) as writer:
-            for name, topic in reader.details.items():
-                record = TopicRecord(
-                    name=name,
-                    msgtype=topic.msgtype,
-                    definition=topic.definition_bytes,
-                    type_hash=topic.type_hash,
-                    serialization=topic.encoding,
-                    encoding=topic.schema_encoding,
-                )
-                writer.copy_topic(record, topic.qos)
-            writer.write_raw(first.topic, first.data, first.time_ns)
-            for message in messages:
-                writer.write_raw(message.topic, message.data, message.time_ns)
-            return Recovered(writer.counts.total(), len(reader.details), reader.losses)
+    refuse_input_as_output(str(reader.path), out)
+    messages = reader.messages()
+    if (first := next(messages, None)) is None:
+        raise BagError(f"{reader.path} holds no message that can be read")
+    with BagWriter(out, metadata=reader.metadata, replace=replace) as writer:
+        for name, topic in reader.details.items():
+            record = TopicRecord(
+                name=name,
+                msgtype=topic.msgtype,
+                definition=topic.definition_bytes,
+                type_hash=topic.type_hash,
+                serialization=topic.encoding,
+                encoding=topic.schema_encoding,
+            )
+            writer.copy_topic(record, topic.qos)
+        writer.write_raw(first.topic, first.data, first.time_ns)
+        for message in messages:
+            writer.write_raw(message.topic, message.data, message.time_ns)
+        return Recovered(writer.counts.total(), len(reader.details), reader.losses)
