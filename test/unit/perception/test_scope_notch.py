@@ -20,7 +20,8 @@ from knee_gap_perception.image.field_of_view import FieldOfView
 from knee_gap_perception.messages_tracking import fill_scope_notch, fill_scope_rotation, notch_from_message
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
 from knee_gap_perception.scope_pose.scope_tracker import NO_NOTCH_YET, ScopeTracker, TrackingParameters
-from knee_gap_perception.scope_rotation.notch import Notch, NotchShape, common_shape, find_notch
+from knee_gap_perception.scope_rotation.notch import Notch, NotchShape, common_shape, find_notch, notches_of
+from knee_gap_perception.scope_rotation.notch_border import STEP, STEPS, Border
 from knee_gap_perception.scope_rotation.notch_tracker import (
     FAR_AWAY,
     NO_FIELD,
@@ -127,6 +128,32 @@ def test_a_notch_of_another_shape_is_not_this_scopes() -> None:
     assert find_notch(picture(0.4, depth=0.1), FIELD) is not None
     follower = NotchFollower(SHAPE)
     assert {follower.look(stamp(k), picture(0.4, depth=0.1, seed=k)).reason for k in range(4)} == {NO_NOTCH}
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.11, 0.15, -0.05, -0.10, -0.15])
+@pytest.mark.parametrize("angle", [0.4, 2.9, -1.0])
+def test_a_notch_is_found_from_far_inside_to_far_outside_the_disc(depth: float, angle: float) -> None:
+    """Real ones point outwards to 1.11 of the radius."""
+    notch = find_notch(picture(angle, depth=depth), FIELD)
+    assert notch is not None
+    assert np.degrees(abs(notch.angle - angle)) < 0.15
+    assert notch.depth == pytest.approx(depth, rel=0.2)
+
+
+def test_a_notch_that_the_frame_cuts_is_not_guessed() -> None:
+    assert find_notch(picture(1.3, depth=-0.1), FIELD) is None
+
+
+def test_a_notch_beside_a_border_that_bulges_is_the_same_notch() -> None:
+    """A disc that is not quite round leaves its circle by more than the least depth of a notch."""
+    angle = np.arange(STEPS) * STEP
+    notch = 0.1 * np.clip(1.0 - np.abs(angle - 2.0) / np.radians(3.3), 0.0, 1.0)
+    bulge = 0.014 * np.exp(-(((angle - 2.0) / 0.25) ** 2))
+    for side in (1.0, -1.0):
+        border = Border(side * (notch + bulge), np.ones(STEPS, bool), CENTRE, RADIUS)
+        (found,) = notches_of(border)
+        assert np.degrees(abs(found.angle - 2.0)) < 0.2
+        assert side * found.depth == pytest.approx(0.114, abs=0.005)
 
 
 def test_a_dark_or_full_picture_has_no_border() -> None:

@@ -16,7 +16,7 @@ from knee_gap_perception.image.field_of_view import FieldOfView
 from knee_gap_perception.scope_rotation.notch_border import STEP, STEPS, Border, find_border
 
 MIN_DEPTH = 0.012  # of the radius
-MAX_DEPTH = 0.11
+MAX_DEPTH = 0.16
 WIDTHS = (np.radians(1.0), np.radians(14.0))  # at a third of the depth
 FLANK = 0.6  # of the width, on either side, that must show the border itself
 FLAT = 0.3  # of the depth, within which the flanks lie about the border
@@ -82,6 +82,8 @@ def notches_of(border: Border, shape: NotchShape | None = None) -> list[Notch]:
         least = MIN_DEPTH if shape is None else FOOT * abs(shape.depth)
         for run in _runs(depth > least):
             notch = _notch(border, side, run)
+            if notch is None and shape is None:
+                notch = _notch(border, side, _tip(depth, run))
             if notch is not None and (shape is None or shape.fits(notch)):
                 found.append(notch)
     return found
@@ -115,6 +117,19 @@ def _notch(border: Border, side: float, run: npt.NDArray[np.intp]) -> Notch | No
     angle = float(weight @ np.arange(len(reach))) / float(weight.sum()) + float(reach[0])
     angle = (angle * STEP + np.pi) % (2 * np.pi) - np.pi
     return Notch(angle, side * peak, width)
+
+
+def _tip(depth: Array, run: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """The part of a run about its deepest direction that is above the foot.
+
+    A border that lies a little beside its circle makes one run of a notch and what is beside it.
+    """
+    high = depth[run] > FOOT * float(depth[run].max())
+    middle = int(depth[run].argmax())
+    low_before, low_behind = np.flatnonzero(~high[:middle]), np.flatnonzero(~high[middle:])
+    begin = int(low_before[-1]) + 1 if len(low_before) else 0
+    end = middle + int(low_behind[0]) if len(low_behind) else len(run)
+    return run[begin:end]
 
 
 def _width(depth: Array, tip: int, level: float) -> float:

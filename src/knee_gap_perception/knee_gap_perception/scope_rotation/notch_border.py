@@ -13,7 +13,7 @@ from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 
 STEPS = 480  # around the border: three quarters of a degree, six pixels of a field of 450 px
 STEP = 2.0 * np.pi / STEPS
-INNER, OUTER = 0.80, 1.08  # band that is looked at, in radii of the field
+INNER, OUTER = 0.80, 1.18  # band that is looked at, in radii of the field
 SURROUND = 1.04  # from here on outwards a direction shows what lies outside the field
 TISSUE = 0.88  # up to here from inside a direction shows what lies in the picture, never the notch
 ACROSS = 0.005  # between two samples where the border may be; twice that beyond, where nothing is measured
