@@ -9,7 +9,14 @@ from endoscope_images import LAPAROSCOPE, RIGID_ENDOSCOPE, laparoscope_video, ri
 from recordings import origins
 
 from knee_gap_core.values.arrays import Image
-from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, find_field_of_view
+from knee_gap_perception.image.field_of_view import (
+    NO_BORDER,
+    TOO_DARK,
+    FieldOfView,
+    FieldOfViewFinder,
+    find_field_of_view,
+    why_no_field,
+)
 
 
 def disc(
@@ -142,3 +149,111 @@ def test_real_laparoscope(origin: str, tmp_path: Path) -> None:
     dark = find_field_of_view((image * 0.25).astype(np.uint8))
     assert dark is not None
     assert dark.radius == pytest.approx(radius, abs=12)
+
+
+def picture_of(
+    centre: tuple[float, float],
+    radii: tuple[float, float],
+    surround: Image,
+    seed: int = 0,
+) -> Image:
+    """Tissue with a gap from rim to rim and a bright and a dark half, in an ellipse, on a surround."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[0 : surround.shape[0], 0 : surround.shape[1]].astype(np.float32)
+    x, y = (columns - centre[0]) / radii[0], (rows - centre[1]) / radii[1]
+    away = np.hypot(x, y)
+    light = (150.0 + 60.0 * x) * (1.0 - 0.3 * away**2)
+    light[np.abs(y - 0.3 * x - 0.2) < 0.12] = 25.0
+    tissue = light[..., None] * np.array([0.75, 0.82, 1.0], np.float32)
+    inside = np.clip((1.0 - away) * radii[0] / 2.0, 0.0, 1.0)[..., None]
+    image = inside * tissue + (1.0 - inside) * surround
+    return np.asarray(np.clip(image + rng.normal(0, 1.5, image.shape), 0, 255), np.uint8)
+
+
+def even(size: tuple[int, int], *colour: float) -> Image:
+    return np.full((size[1], size[0], 3), colour, np.uint8)
+
+
+HD, SMALL = (1280, 720), (640, 360)
+
+
+def reflecting(size: tuple[int, int]) -> Image:
+    """A screen that was photographed: grey with a bright reflection, and a white strip beside it."""
+    rows, columns = np.mgrid[0 : size[1], 0 : size[0]]
+    image = 30.0 + 45.0 * np.exp(-(((columns - 0.9 * size[0]) / 90.0) ** 2 + ((rows - 60.0) / 80.0) ** 2))
+    image[:, : size[0] // 30] = 220.0
+    return np.repeat(image.astype(np.uint8)[..., None], 3, axis=2)
+
+
+def labelled(size: tuple[int, int]) -> Image:
+    """Text and a symbol beside the disc, and text across its rim."""
+    image = even(size, 0, 0, 0)
+    for row, text in enumerate(("PATIENT 42", "12:31:07", "KNEE")):
+        place = (10, 60 + 200 * row)
+        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 1.2, (255, 255, 255), 3)
+    cv2.rectangle(image, (1130, 600), (1260, 700), (200, 200, 200), -1)
+    return image
+
+
+@pytest.mark.parametrize(
+    ("surround", "centre", "radius"),
+    [
+        (even(SMALL, 42, 42, 42), (320.0, 180.0), 170.0),
+        (even(SMALL, 90, 90, 90), (300.0, 190.0), 150.0),
+        (even(HD, 120, 40, 30), (640.0, 360.0), 340.0),
+        (even(SMALL, 30, 30, 30), (320.0, 180.0), 334.0),  # dark corners alone
+        (even(SMALL, 0, 0, 0), (322.0, 178.0), 330.0),
+        (even(SMALL, 0, 0, 0), (315.0, 182.0), 345.0),
+        (even(HD, 3, 3, 3), (640.0, 360.0), 560.0),  # cut above and below
+        (reflecting(SMALL), (330.0, 180.0), 200.0),
+        (labelled(HD), (700.0, 360.0), 350.0),
+    ],
+    ids=("grey", "light grey", "blue", "grey corners", "corners", "smaller corners", "cut", "screen", "text"),
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_disc_on_other_surrounds(
+    surround: Image, centre: tuple[float, float], radius: float, seed: int
+) -> None:
+    field = find_field_of_view(picture_of(centre, (radius, radius), surround, seed))
+    assert field is not None
+    np.testing.assert_allclose(field.centre, centre, atol=0.025 * radius)
+    assert field.radius == pytest.approx(radius, rel=0.025)
+
+
+def test_the_disc_of_a_stretched_picture_is_about_its_middle() -> None:
+    field = find_field_of_view(picture_of((640.0, 360.0), (370.0, 342.0), even(HD, 2, 2, 2)))
+    assert field is not None
+    np.testing.assert_allclose(field.centre, (640.0, 360.0), atol=10.0)
+    assert 340.0 < field.radius < 372.0
+
+
+def test_what_fills_the_frame_has_no_disc_whatever_is_round_in_it() -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        image = np.clip(rng.normal(130, 3, (360, 640, 3)), 0, 255).astype(np.uint8)
+        centre = (int(rng.uniform(200, 440)), int(rng.uniform(120, 240)))
+        cv2.circle(image, centre, int(rng.uniform(60, 110)), (30, 40, 60), -1)
+        cv2.circle(image, (320, 180), 150, (220, 220, 230), 9)
+        field = find_field_of_view(image)
+        assert field is not None
+        assert np.isinf(field.radius)
+
+
+def test_it_is_said_why_no_field_is_found() -> None:
+    dark = np.full((360, 640, 3), 3, np.uint8)
+    assert find_field_of_view(dark) is None
+    assert why_no_field(dark) == TOO_DARK
+    # A lit corner, as when tissue lies on half of the lens.
+    half = dark.copy()
+    cv2.fillPoly(half, [np.array([[150, 0], [400, 0], [0, 300], [0, 150]])], (90, 100, 140))
+    assert find_field_of_view(half) is None
+    assert why_no_field(half) == NO_BORDER
+
+
+def test_a_light_surround_does_not_make_the_stream_search_at_every_check() -> None:
+    finder, searches = FieldOfViewFinder(), []
+    image = picture_of((320.0, 180.0), (150.0, 150.0), even(SMALL, 90, 90, 90))
+    for _ in range(40):
+        searches.append(finder.find(image))
+    # The same object as long as it is not looked for again.
+    assert len({id(field) for field in searches}) == 1

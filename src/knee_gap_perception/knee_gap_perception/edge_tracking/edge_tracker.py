@@ -15,7 +15,7 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.gap_detection.gap_detector import GapSearch, NoPointsError, check_light
 from knee_gap_perception.gap_detection.section_edges import SectionEdgeFinder
-from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder
+from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, why_no_field
 from knee_gap_perception.point_tracking.point_selection import choose_points
 from knee_gap_perception.point_tracking.point_tracker import PointObservation, PointTracker
 from knee_gap_perception.point_tracking.tangent_plane import View
@@ -110,7 +110,9 @@ class GapEdgeTracker:
             place = f"{clicked[0]:g}, {clicked[1]:g}"
             return f"the point must lie in the image of {width}x{height} px, not at {place}"
         field = self._finder.find(self._image)
-        if field is None or field.depth_inside(clicked) <= 0:
+        if field is None:
+            return why_no_field(self._image)
+        if field.depth_inside(clicked) <= 0:
             return "the point lies outside the field of view"
         try:
             self._search.section(self._image, camera, field, clicked)
@@ -205,9 +207,7 @@ class GapEdgeTracker:
         field = self._finder.find(picture)
         if field is None:
             self.end_track()
-            raise NoPointsError(
-                EdgeStatus.LOW_CONTRAST, "the picture is too dark to find the field of view in"
-            )
+            raise NoPointsError(EdgeStatus.LOW_CONTRAST, why_no_field(picture))
         grey = np.asarray(cv2.extractChannel(picture, 1), np.uint8)
         if self._track is None:
             observations = self._start(stamp_ns, picture, grey, camera, view, field)

@@ -1,20 +1,30 @@
 """Detection of the field of view: the disc of the image that the scope fills."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_core.values.arrays import Array, Mask
+from knee_gap_core.values.arrays import Array, Image, Mask
+from knee_gap_perception.image.disc import INLIER_DISTANCE, Circle, fit_circle, rim_lit
 
 Brightness = npt.NDArray[np.uint8]
 
 WORKING_ROWS = 180  # image rows at which the disc is searched
-HYPOTHESES = 400  # circles through three boundary points
-INLIER_DISTANCE = 1.2  # [px at working size]
+LEAST_LIGHT = 16.0  # [grey levels] above black, of the brighter part of a picture
+LOOSE = 4.0  # [px at working size] within which points lie on the circle of a stretched picture
+MOST_POINTS = 300  # of edges that are looked at
+BLACK = 24.0  # [grey levels] up to which a surround is black: that of limited-range video is 16
+EVEN = 3.0  # [grey levels] by which a corner of an even surround differs from its colour
+APART = 10  # [grey levels] from the surround, from which a pixel belongs to the picture
+FILLED = 0.7  # of a disc, that differs from an even surround: a gap may look like it
+LEAST_PICTURE = 0.05  # of an image with an even surround
 STRAIGHT_SHARE = 0.25  # of a side's rows or columns; a disc's own extreme has less within a pixel
-MINIMUM_ARC = np.radians(90)  # visible boundary needed to accept a circle
+
+TOO_DARK = "the picture is too dark to find the field of view in"
+NO_BORDER = "the field of view is not found: the picture shows no round border and does not fill the frame"
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,11 @@ def brightness(image: Brightness) -> Brightness:
 
 
 def find_field_of_view(image: npt.NDArray[np.uint8]) -> FieldOfView | None:
-    """The field of view in an image (h, w, 3); None if the image is too dark."""
+    """The field of view in an image (h, w, 3); None if none is found, as in the dark.
+
+    A picture that fills the frame, or a box in it, is a field without a disc. One that does neither and shows
+    no circle, as when half of it is in shade, is not guessed.
+    """
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_ROWS / min(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -76,22 +90,130 @@ def find_field_of_view(image: npt.NDArray[np.uint8]) -> FieldOfView | None:
     if threshold is None:
         return None
     picture = _largest_part(small > threshold)
-    boundary, straight = _boundary(picture)
-    circle = _fit_circle(boundary)
+    best = _best_outline(picture, resized, small)
     ratio = np.array([width / size[0], height / size[1]])
-    if circle is None:
+    if best.circle is None:
         corners_bright = (_corners(small) > threshold).sum() >= 3
         box = _full_box(_sides(picture), ratio)
         centre = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
         return FieldOfView(centre, float("inf"), box) if corners_bright or _fills(picture) else None
-    x, y, radius = circle
-    # Only a straight side cuts the disc; if the picture just ends early, the gap reaches the rim.
-    sides = [-0.5, -0.5, size[0] - 0.5, size[1] - 0.5]
-    sides = [
-        cut if cuts else frame for cut, cuts, frame in zip(_sides(picture), straight, sides, strict=True)
-    ]
+    x, y, radius, _ = best.circle
     centre = ((x + 0.5) * ratio[0] - 0.5, (y + 0.5) * ratio[1] - 0.5)
-    return FieldOfView(centre, float(radius * ratio.mean()), _full_box(sides, ratio))
+    return FieldOfView(centre, float(radius * ratio.mean()), _full_box(best.sides, ratio))
+
+
+class _Outline(NamedTuple):
+    """A circle, if one is found, the sides that cut it [px at working size], and the image that shows it."""
+
+    circle: Circle | None
+    sides: list[float]
+    shown_by: Brightness
+
+    def is_sure(self, *rules: tuple[float, float]) -> bool:
+        """Whether a rule holds: shares of the points that lie on the circle, and of its lit directions."""
+        if self.circle is None:
+            return False
+        lit = rim_lit(self.shown_by, self.circle)
+        return any(self.circle.share >= share and lit >= least_lit for share, least_lit in rules)
+
+
+def _best_outline(picture: Mask, resized: Image, small: Brightness) -> _Outline:
+    """The circle around a picture; where it is not sure, one by other signs that is, if there is any.
+
+    The other signs: an even surround that is not black, edges, a disc that was stretched.
+    """
+    apart = _apart_from_surround(resized)
+    if apart is not None:
+        other = _outlined(_largest_part(apart > APART), apart)
+        if other.is_sure((0.8, 0.6)) and other.circle is not None and _is_filled(apart, other.circle):
+            return other
+    best = _outlined(picture, small)
+    if best.is_sure((0.57, 0.6), (0.75, 0.45)):
+        return best
+    edges, boundary = _edge_points(small), _boundary(picture)[0]
+    for points, within, rule in (
+        (boundary, LOOSE, (0.9, 0.7)),
+        (edges, INLIER_DISTANCE, (0.4, 0.75)),
+        (edges, LOOSE, (0.6, 0.7)),
+        (boundary, LOOSE, (0.8, 0.9)),
+    ):
+        circle = fit_circle(points[:: 1 + len(points) // MOST_POINTS], within)
+        if circle is not None and _surround_is_dark(small, circle):
+            other = _Outline(circle, best.sides, small)
+            if other.is_sure(rule):
+                return other
+    return best
+
+
+def _outlined(picture: Mask, small: Brightness) -> _Outline:
+    """The circle around a picture, as an image shows it."""
+    boundary, straight = _boundary(picture)
+    # Only a straight side cuts the disc; if the picture just ends early, the gap reaches the rim.
+    frame = [-0.5, -0.5, small.shape[1] - 0.5, small.shape[0] - 0.5]
+    sides = [cut if cuts else end for cut, cuts, end in zip(_sides(picture), straight, frame, strict=True)]
+    return _Outline(fit_circle(boundary), sides, small)
+
+
+def _apart_from_surround(resized: Image) -> Brightness | None:
+    """Difference of each pixel from an even surround that is not black; None if there is none."""
+    n = max(2, min(resized.shape[:2]) // 20)
+    parts = [
+        resized[rows, columns].reshape(-1, 3)
+        for rows in (slice(n), slice(-n, None))
+        for columns in (slice(n), slice(-n, None))
+    ]
+    colours = np.array([np.median(part, axis=0) for part in parts])
+    even = np.array(
+        [np.abs(part - colour).max(axis=1).mean() < EVEN for part, colour in zip(parts, colours, strict=True)]
+    )
+    if even.sum() < 3:
+        return None
+    surround = np.median(colours[even], axis=0)
+    alike = (np.abs(colours - surround).max(axis=1) < 2 * EVEN) & even
+    if alike.sum() < 3 or surround.max() <= BLACK:
+        return None
+    difference = cv2.absdiff(resized, np.full_like(resized, surround.astype(np.uint8)))
+    apart = np.asarray(cv2.medianBlur(brightness(np.asarray(difference, np.uint8)), 3), np.uint8)
+    return apart if (apart > APART).mean() > LEAST_PICTURE else None
+
+
+def _edge_points(small: Brightness) -> Array:
+    """Points (n, 2) at which rows and columns, from outside inwards, first become much brighter."""
+    height, width = small.shape
+    least = 4.0 * max(8.0, 0.1 * float(np.percentile(small, 95)))
+    rows, columns = np.arange(height), np.arange(width)
+    points = []
+    for inwards, axis in (((1, 0), 1), ((0, 1), 0)):
+        slope = cv2.Sobel(small, cv2.CV_16S, *inwards)
+        for way in (1, -1):
+            rising = slope * way > least
+            if way < 0:
+                rising = np.flip(rising, axis)
+            first = rising.argmax(axis=axis)
+            known = rising.any(axis=axis)
+            if way < 0:
+                first = small.shape[axis] - 1 - first
+            along = rows if axis else columns
+            pair = (first, along) if axis else (along, first)
+            points.append(np.stack(pair, axis=1)[known])
+    found = np.concatenate(points).astype(np.float64)
+    inner = ((found > 1) & (found < [width - 2, height - 2])).all(axis=1)
+    return np.asarray(found[inner])
+
+
+def _is_filled(apart: Brightness, circle: Circle) -> bool:
+    """Whether most of a circle differs from the surround: it is no ring on tissue."""
+    rows, columns = np.ogrid[: apart.shape[0], : apart.shape[1]]
+    inside = np.hypot(columns - circle.x, rows - circle.y) < circle.radius
+    return bool((apart[inside] > APART).mean() > FILLED)
+
+
+def _surround_is_dark(small: Brightness, circle: Circle) -> bool:
+    """Whether outside a circle the image is mostly darker than half of what is inside."""
+    rows, columns = np.ogrid[: small.shape[0], : small.shape[1]]
+    away = np.hypot(columns - circle.x, rows - circle.y)
+    inside, outside = small[away < 0.97 * circle.radius], small[away > 1.04 * circle.radius]
+    return bool(outside.size and np.percentile(outside, 70) < 0.5 * np.median(inside))
 
 
 def _corners(small: Brightness) -> npt.NDArray[np.float64]:
@@ -105,10 +227,10 @@ def _picture_threshold(small: Brightness) -> float | None:
     """Brightness threshold between picture and surround; None if there is no picture."""
     dark = float(_corners(small).min())
     bright = float(np.percentile(small, 95))
-    if bright - min(dark, 24.0) < 16:
+    if bright - min(dark, BLACK) < LEAST_LIGHT:
         return None
-    # A surround is black up to the 16 of limited-range video; a brighter corner belongs to the picture.
-    dark = min(dark, 24.0)
+    # A brighter corner belongs to the picture.
+    dark = min(dark, BLACK)
     return dark + max(6.0, 0.06 * (bright - dark))
 
 
@@ -174,59 +296,10 @@ def _boundary(picture: Mask) -> tuple[Array, list[bool]]:
     return points[inner], straight
 
 
-def _fit_circle(points: Array) -> tuple[float, float, float] | None:
-    """Centre and radius of the circle on which most points lie; None if no circle fits them."""
-    if len(points) < 40:
-        return None
-    triples = np.random.default_rng(0).integers(0, len(points), (HYPOTHESES, 3))
-    circles = _circumcircles(points[triples])
-    spread = np.ptp(points, axis=0).max()
-    # The disc spans most of its own boundary box, or is cut by the frame and then larger.
-    plausible = (circles[:, 2] > 0.3 * spread) & (circles[:, 2] < 1.2 * spread)
-    circles = circles[plausible]
-    if not len(circles):
-        return None
-    distance = np.hypot(points[:, 0] - circles[:, :1], points[:, 1] - circles[:, 1:2]) - circles[:, 2:]
-    best = circles[(np.abs(distance) < INLIER_DISTANCE).sum(axis=1).argmax()]
-    for _ in range(5):
-        inliers = points[_on_circle(points, best)]
-        if len(inliers) < 20:
-            return None
-        best = _least_squares_circle(inliers)
-    inliers = points[_on_circle(points, best)]
-    angle = np.arctan2(inliers[:, 1] - best[1], inliers[:, 0] - best[0])
-    arc = np.unique(np.floor((angle + np.pi) / (2 * np.pi) * 72)).size / 72 * 2 * np.pi
-    if arc < MINIMUM_ARC or len(inliers) < 0.35 * len(points):
-        return None
-    return float(best[0]), float(best[1]), float(best[2])
-
-
-def _on_circle(points: Array, circle: Array) -> Mask:
-    distance = np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2]
-    return np.asarray(np.abs(distance) < INLIER_DISTANCE)
-
-
-def _circumcircles(triples: Array) -> Array:
-    """Circles (n, 3) through triples of points (n, 3, 2); NaN for points on a line."""
-    a, b, c = np.moveaxis(triples, 1, 0)
-    ab, ac = b - a, c - a
-    cross = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    cross = np.where(np.abs(cross) < 1.0, np.nan, cross)
-    ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
-    x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / cross
-    y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / cross
-    return np.stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)], axis=1)
-
-
-def _least_squares_circle(points: Array) -> Array:
-    """Circle (3,) through points (n, 2), least squares of the algebraic distance."""
-    mean = points.mean(axis=0)
-    x, y = (points - mean).T
-    design = np.stack([x, y, np.ones_like(x)], axis=1)
-    solution = np.linalg.lstsq(design, x * x + y * y, rcond=None)[0]
-    centre = solution[:2] / 2
-    radius = np.sqrt(solution[2] + centre @ centre)
-    return np.array([centre[0] + mean[0], centre[1] + mean[1], radius])
+def why_no_field(image: npt.NDArray[np.uint8]) -> str:
+    """Why no field of view is found in an image (h, w, 3), in words."""
+    light = np.percentile(image[::8, ::8].max(axis=2), 95)
+    return TOO_DARK if light < LEAST_LIGHT else NO_BORDER
 
 
 class FieldOfViewFinder:
@@ -244,6 +317,7 @@ class FieldOfViewFinder:
         self._shape: tuple[int, ...] = ()
         self._age = 0
         self._misfits = 0
+        self._light_surround = False
 
     def find(self, image: npt.NDArray[np.uint8]) -> FieldOfView | None:
         """The field of view of the stream's next image (h, w, 3); None until an image is bright enough."""
@@ -252,7 +326,7 @@ class FieldOfViewFinder:
         self._age += 1
         if self._field is not None and np.isfinite(self._field.radius):
             if self._age % self.CHECK_EVERY == 0:
-                self._misfits = self._misfits + 1 if self._misfit(image) else 0
+                self._misfits = self._misfits + 1 if self._no_longer_fits(image) else 0
             if self._misfits < self.MISFITS and self._age % self.REFRESH_EVERY:
                 return self._field
         elif self._field is not None and self._age % self.RETRY_EVERY:
@@ -261,17 +335,25 @@ class FieldOfViewFinder:
         found = find_field_of_view(image)
         if found is not None:
             self._field = found
+            # A light surround looks like picture outside the disc from the first.
+            self._light_surround = bool(np.isfinite(found.radius)) and self._misfit(image)[0]
         return self._field
 
-    def _misfit(self, image: npt.NDArray[np.uint8]) -> bool:
-        """Whether there is picture well outside the disc, or none along its rim, on a coarse grid."""
+    def _misfit(self, image: npt.NDArray[np.uint8]) -> tuple[bool, bool]:
+        """Whether there is picture well outside the disc, and whether there is none along its rim."""
         assert self._field is not None
         step = max(1, min(image.shape[:2]) // 40)
         grid = image[step // 2 :: step, step // 2 :: step].max(axis=2)
         rows, columns = np.mgrid[0 : grid.shape[0], 0 : grid.shape[1]] * step + step // 2
         away = np.hypot(columns - self._field.centre[0], rows - self._field.centre[1]) / self._field.radius
         outside, rim = away > 1.05, (away > 0.8) & (away < 0.97)
-        if outside.any() and (grid[outside] > 60).mean() > 0.1:
-            return True
         # A gap crosses the rim in two places and leaves most of it lit.
-        return bool(rim.any() and (grid[rim] < 16).mean() > 0.6)
+        return (
+            bool(outside.any() and (grid[outside] > 60).mean() > 0.1),
+            bool(rim.any() and (grid[rim] < 16).mean() > 0.6),
+        )
+
+    def _no_longer_fits(self, image: npt.NDArray[np.uint8]) -> bool:
+        """Whether an image shows, on a coarse grid, that the disc is another one."""
+        beyond, dark_rim = self._misfit(image)
+        return dark_rim or (beyond and not self._light_surround)
