@@ -24,15 +24,15 @@ def look_textures(seed: int, tissues: Tissues) -> FloatImage:
     mottle, grain, relief = tissues.mottle, tissues.grain, tissues.relief
     kinds = (
         Tissue(tissues.condyle, pink, 0.25 * tissues.blush, mottle, grain, relief=relief),
-        Tissue(tissues.plateau, pink, 0.35 * tissues.blush, mottle, grain, relief=relief),
+        Tissue(tissues.plateau, pink, 0.35 * tissues.blush, 1.8 * mottle, 1.5 * grain, relief=1.6 * relief),
         Tissue(
             tissues.meniscus,
             pink,
             tissues.blush,
-            mottle,
-            grain,
+            1.8 * mottle,
+            1.5 * grain,
             tissues.fibres,
-            relief=relief,
+            relief=1.8 * relief,
             vessels=tissues.meniscus_vessels,
             vessel_colour=(200, 96, 88),
         ),
