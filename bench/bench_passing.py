@@ -14,30 +14,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from knee_gap_bringup.leg_control import Action, Estimate, LegControl, LegParameters
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import (
-    EdgeObservation,
-    EdgeSection,
-    EdgeState,
-    GapEstimate,
-    GapStatus,
-)
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator
-from knee_gap_simulation.recordings.section_truth import edges_at_section, true_instrument_gap
+from knee_gap_simulation.knee_views import ViewDrawer, edges_seen, points_beside
+from knee_gap_simulation.recordings.section_truth import true_instrument_gap
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 
-INSET = np.radians(2.0)
-POINT_ERROR, EDGE_ERROR = np.radians(0.05), np.radians(0.15)  # standard deviations of directions
-POSITION_ERROR, ROTATION_ERROR = 0.0367e-3 / np.sqrt(3.0), np.radians(0.004) / np.sqrt(3.0)
 TOO_THICK = 0.05e-3
-KIND_RIM, KIND_CONTOUR = 1, 2
 
 
 @dataclass
@@ -71,12 +61,12 @@ class Run:
 
     def __init__(self, level: int, seed: int, direction: str, fps: float) -> None:
         self._simulator = KneeSimulator(level, seed, direction, duration_s=3.0, fps=fps)
-        self._rng = np.random.default_rng([seed, 0x5041])
+        self._drawer = ViewDrawer(np.random.default_rng([seed, 0x5041]))
         self._times = np.arange(0.3, 3.0, 1.0 / fps)
         scene = self._simulator.scene
         self._middle = scene.ridge(0.0)[0] - (0.0, 0.5 * (self._simulator.settings.gap or 0.0), 0.0)
         first = self._simulator.pose(float(self._times[0]))
-        self._points = self._inset_points(first, self._edges(first))
+        self._points = points_beside(scene, first, self._edges(first))
 
     def views(self) -> Iterator[tuple[EdgeObservation, LensPose, float]]:
         """Observation, tracked lens pose and true gap [m] of each image."""
@@ -87,66 +77,12 @@ class Run:
                 continue
             truth = true_instrument_gap(self._simulator.scene, T_scene_lens, edges).diameter
             stamp_ns = round(1e9 * (1.0 + time))
-            yield self._observation(stamp_ns, T_scene_lens, edges), self._pose(stamp_ns, T_scene_lens), truth
+            observation = self._drawer.observation(stamp_ns, T_scene_lens, self._points, edges)
+            yield observation, self._drawer.lens_pose(stamp_ns, T_scene_lens), truth
 
     def _edges(self, T_scene_lens: Array) -> Array:
         """True bearings (2, 3) of the edges through the middle of the gap, the condyle's first."""
-        lens, scene = self._simulator.lens, self._simulator.scene
-        pixel = lens.pixels(T_scene_lens[:3, :3].T @ (self._middle - T_scene_lens[:3, 3]))
-        return edges_at_section(scene, lens, T_scene_lens, pixel)
-
-    def _inset_points(self, T_scene_lens: Array, edges: Array) -> Array:
-        """Surface points (2, 3) beside the edges, in the scene."""
-        view, across = edges.sum(axis=0), edges[1] - edges[0]
-        view, across = view / np.linalg.norm(view), across / np.linalg.norm(across)
-        half = 0.5 * float(np.arccos(np.clip(edges[0] @ edges[1], -1.0, 1.0)))
-        angles = np.array([-half - INSET, half + INSET])[:, None]
-        points = self._simulator.scene.surface_points(
-            T_scene_lens, np.cos(angles) * view + np.sin(angles) * across
-        )
-        if not np.isfinite(points).all():
-            raise SimulationError("the section has no tissue beside its edges")
-        return np.asarray(points)
-
-    def _observation(self, stamp_ns: int, T_scene_lens: Array, edges: Array) -> EdgeObservation:
-        seen = (self._points - T_scene_lens[:3, 3]) @ T_scene_lens[:3, :3]
-        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-        bearings = self._wrong(seen, POINT_ERROR)
-        # The edge is wrong across the opening, which is where it is looked for.
-        axis = np.cross(edges[0], edges[1])
-        axis /= np.linalg.norm(axis)
-        turned = [
-            Rotation.from_rotvec(EDGE_ERROR * self._rng.standard_normal() * axis).apply(edge)
-            for edge in edges
-        ]
-        outer = bearings[..., :, None] * bearings[..., None, :]
-        return EdgeObservation(
-            stamp_ns,
-            1,
-            True,
-            bearings,
-            POINT_ERROR**2 * (np.eye(3) - outer),
-            angular_error=3.0 * POINT_ERROR,
-            kinds=(KIND_CONTOUR, KIND_RIM),
-            section=EdgeSection(
-                (EdgeState.SEEN, EdgeState.SEEN), np.array(turned), np.full(2, EDGE_ERROR), 3.0 * EDGE_ERROR
-            ),
-        )
-
-    def _wrong(self, directions: Array, deviation: float) -> Array:
-        moved = directions + deviation * self._rng.standard_normal(directions.shape)
-        return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
-
-    def _pose(self, stamp_ns: int, T_scene_lens: Array) -> LensPose:
-        turn = Rotation.from_rotvec(ROTATION_ERROR * self._rng.standard_normal(3))
-        rotation = Rotation.from_matrix(T_scene_lens[:3, :3]) * turn
-        return LensPose(
-            stamp_ns=stamp_ns,
-            frame_id="world",
-            position=T_scene_lens[:3, 3] + POSITION_ERROR * self._rng.standard_normal(3),
-            quaternion_xyzw=rotation.as_quat(),
-            covariance=np.diag([POSITION_ERROR**2] * 3 + [ROTATION_ERROR**2] * 3),
-        )
+        return edges_seen(self._simulator.scene, self._simulator.lens, T_scene_lens, self._middle)
 
 
 def is_passed(estimates: Sequence[GapEstimate], diameter: float) -> bool:
