@@ -22,6 +22,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
+            "closed_loop = knee_gap_bringup.entry_points:closed_loop",
             "demo = knee_gap_bringup.entry_points:demo",
             "leg_controller_node = knee_gap_bringup.entry_points:leg_controller_node",
             "live = knee_gap_bringup.entry_points:live",

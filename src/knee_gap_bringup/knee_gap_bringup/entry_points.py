@@ -2,6 +2,7 @@
 
 from knee_gap_core.node.entry import entry
 
+closed_loop = entry("knee_gap_bringup.closed_loop.command")
 demo = entry("knee_gap_bringup.demo")
 leg_controller_node = entry("knee_gap_bringup.leg_controller_node", node=True)
 live = entry("knee_gap_bringup.launching.live_command")
