@@ -12,8 +12,9 @@ setup: ## set up whatever is missing
 demo: setup ## play the sample bag through the live nodes; results in out/demo
 	@tools/run knee_gap_bringup demo
 
-test: setup ## run all tests
-	@tools/env python -m pytest
+test: setup ## run all tests: of units on two cores, then of processes one after the other
+	@tools/env python -m pytest --numprocesses 2 --dist loadfile test/unit; units=$$?; \
+	tools/env python -m pytest test/system && exit $$units
 
 lint: setup ## ruff, mypy
 	@tools/env ruff check .
