@@ -220,6 +220,31 @@ def test_disc_on_other_surrounds(
     assert field.radius == pytest.approx(radius, rel=0.025)
 
 
+def test_a_disc_that_ends_in_black_along_a_curve_is_cut_there() -> None:
+    """As where the video was undistorted: above from row 60 to 85, below from row 660 to 645."""
+    image = picture_of((640.0, 360.0), (350.0, 350.0), even(HD, 2, 2, 2))
+    rows, columns = np.mgrid[0:720, 0:1280]
+    bend = ((columns - 640.0) / 350.0) ** 2
+    image[rows < 85.0 - 25.0 * bend] = image[rows > 645.0 + 15.0 * bend] = 2
+    field = find_field_of_view(image)
+    assert field is not None
+    assert field.radius == pytest.approx(350.0, rel=0.025)
+    assert 55.0 < field.box[1] < 90.0
+    assert 640.0 < field.box[3] < 665.0
+    assert (field.box[0], field.box[2]) == (0.0, 1279.0)
+
+
+@pytest.mark.parametrize("level", [14, 25])
+def test_a_gap_along_the_rim_does_not_cut_the_disc(level: int) -> None:
+    image = picture_of((640.0, 360.0), (350.0, 350.0), even(HD, 2, 2, 2))
+    rows, columns = np.mgrid[0:720, 0:1280]
+    image[(rows < 90) & (np.hypot(columns - 640, rows - 360) < 350)] = level
+    field = find_field_of_view(image)
+    assert field is not None
+    assert field.radius == pytest.approx(350.0, rel=0.025)
+    assert field.box == (0.0, 0.0, 1279.0, 719.0)
+
+
 def test_the_disc_of_a_stretched_picture_is_about_its_middle() -> None:
     field = find_field_of_view(picture_of((640.0, 360.0), (370.0, 342.0), even(HD, 2, 2, 2)))
     assert field is not None
