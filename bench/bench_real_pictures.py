@@ -28,7 +28,7 @@ from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK
 ROOT = Path(__file__).resolve().parents[1]
 MARKS = ROOT / "test" / "data" / "marks"
 PICTURES = ROOT.parent / "shared" / "data" / "images"
-COLUMNS, TILE_PX = 5, 400
+COLUMNS, TILE = 5, (400, 300)
 COLOURS = {
     Region.GAP: (60, 255, 60),
     Region.INSTRUMENT: (60, 60, 255),
@@ -146,7 +146,8 @@ def write_csv(scores: Sequence[PictureScore], path: Path) -> None:
 
 def tile(picture: MarkedPicture, image: Image, score: PictureScore, points: Array | None) -> Image:
     """The picture with its marks, the field that was found in yellow, the points, and the verdict."""
-    scale = TILE_PX / max(image.shape[:2])
+    width, height = TILE
+    scale = min(width / image.shape[1], height / image.shape[0])
     drawn = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     for region, colour in COLOURS.items():
         for polygon in picture.polygons(region):
@@ -157,13 +158,13 @@ def tile(picture: MarkedPicture, image: Image, score: PictureScore, points: Arra
         cv2.circle(drawn, centre, round(field.radius * scale), (0, 255, 255), 1, cv2.LINE_AA)
     for point in points if points is not None else ():
         cv2.circle(drawn, (round(point[0] * scale), round(point[1] * scale)), 4, (255, 255, 255), -1)
-    placed = np.zeros((TILE_PX + 40, TILE_PX, 3), np.uint8)
-    placed[: drawn.shape[0], : drawn.shape[1]] = drawn[:TILE_PX, :TILE_PX]
+    placed = np.zeros((height + 40, width, 3), np.uint8)
+    placed[: drawn.shape[0], : drawn.shape[1]] = drawn[:height, :width]
     verdict = "found" if score.found else "FALSE" if score.false else "points" if points is not None else "-"
     field_words = "" if score.field_right else "  field wrong"
     words = (f"{picture.decision}: {verdict}{field_words}", picture.name)
     for row, line in enumerate(words):
-        place = (4, TILE_PX + 14 + 18 * row)
+        place = (4, height + 14 + 18 * row)
         cv2.putText(placed, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
     return placed
 

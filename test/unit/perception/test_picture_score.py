@@ -1,16 +1,20 @@
 """Scores of marked pictures, on drawn ones whose answer is known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from bench_real_pictures import main
 from drawn_joint import Joint
 
 from knee_gap_core.values.arrays import Array, Image
 from knee_gap_perception.evaluation.picture_score import field_errors, mean, score_picture
 from knee_gap_perception.image.field_of_view import FieldOfView
 from knee_gap_perception.marks.marked_picture import Decision, MarkedField, MarkedPicture, Region
+from knee_gap_perception.marks.marks_file import write_marks
+from knee_gap_perception.marks.picture_files import sha256_of
 
 ROUND = MarkedField(disc=(640.0, 360.0, 355.0))
 PICTURE = MarkedPicture("a.png", "0" * 64, 1280, 720, "drawn", "knee", Decision.NO_GAP, field=ROUND)
@@ -75,3 +79,32 @@ def test_a_field_is_right_where_it_is_the_marked_one() -> None:
 def test_the_mean_leaves_out_what_is_not_known() -> None:
     assert mean([1.0, np.nan, 3.0]) == 2.0
     assert np.isnan(mean([np.nan]))
+
+
+def test_the_bench_scores_what_is_there_and_says_what_is_not(
+    drawn: tuple[Image, Array], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image, outline = drawn
+    arguments = [str(tmp_path), "--marks", str(tmp_path / "here.json"), "--out", str(tmp_path / "out")]
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "a.png"), image)
+    marked = replace(
+        PICTURE,
+        sha256=sha256_of(tmp_path / "images" / "a.png"),
+        decision=Decision.GAP,
+        regions={Region.GAP: (outline,)},
+    )
+    write_marks(tmp_path / "here.json", [marked])
+    assert main(arguments) == 0
+    assert "its pictures are skipped" in capsys.readouterr().out
+    (tmp_path / "images").rename(tmp_path / "here")
+    assert main(arguments) == 0
+    assert "| kind knee | 1 | 1 of 1 | 0 of 1 |" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "pictures.csv",
+        "sheet.jpg",
+        "table.md",
+    ]
+    cv2.imwrite(str(tmp_path / "here" / "a.png"), image // 2)
+    assert main(arguments) == 1
+    assert "is not the picture that was marked" in capsys.readouterr().err
