@@ -10,6 +10,7 @@ import csv
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -36,6 +37,7 @@ COLOURS = {
     Region.DRAWN: (255, 200, 60),
     Region.UNCLEAR: (0, 180, 255),
 }
+BINS = (0.0, 0.1, 0.5, 0.9, 1.0)
 HEAD = (
     "pictures",
     "openings found",
@@ -63,10 +65,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         parameters = replace(parameters, segmentation=asked.segmentation)
     scores: list[PictureScore] = []
     tiles: list[Image] = []
+    sections: list[PictureScore] = []
     try:
         for picture, image in marked(asked.marks, asked.folder):
             score, points = score_picture(picture, image, parameters)
             scores.append(score)
+            sections.append(score_picture(picture, image, replace(parameters, minimum_confidence=0.0))[0])
             tiles.append(tile(picture, image, score, points))
     except PerceptionError as error:
         print(f"bench_real_pictures: {error}", file=sys.stderr)
@@ -75,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"bench_real_pictures: no marked pictures in {asked.folder}: nothing is scored")
         return 0
     asked.out.mkdir(parents=True, exist_ok=True)
-    text = table(scores)
+    text = table(scores) + "\n" + reliability(sections)
     (asked.out / "table.md").write_text(text, encoding="utf-8")
     write_csv(scores, asked.out / "pictures.csv")
     cv2.imwrite(str(asked.out / "sheet.jpg"), sheet(tiles))
@@ -106,6 +110,21 @@ def table(scores: Sequence[PictureScore]) -> str:
     groups.append(("all", list(scores)))
     lines = ["| | " + " | ".join(HEAD) + " |", "|---" * (len(HEAD) + 1) + "|"]
     lines += [f"| {name} | " + " | ".join(cells(group)) + " |" for name, group in groups]
+    return "\n".join(lines) + "\n"
+
+
+def reliability(sections: Sequence[PictureScore]) -> str:
+    """By source: of the best sections of its pictures, by their confidence, how many are marked gaps."""
+    names = [f"{low:g} to {high:g}" for low, high in pairwise(BINS)]
+    lines = ["| gaps among sections of confidence | " + " | ".join(names) + " |", "|---" * len(BINS) + "|"]
+    known = [score for score in sections if score.found or score.false]
+    for source in (*dict.fromkeys(score.source for score in known), "all"):
+        group = [score for score in known if source in (score.source, "all")]
+        row = []
+        for low, high in pairwise(BINS):
+            inside = [s for s in group if low <= s.confidence < high or s.confidence == high == 1.0]
+            row.append(share(sum(score.found for score in inside), len(inside)))
+        lines.append(f"| {source} | " + " | ".join(row) + " |")
     return "\n".join(lines) + "\n"
 
 
