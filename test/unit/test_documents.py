@@ -58,6 +58,8 @@ def test_modules_and_files_that_a_page_names_exist(page: Path) -> None:
             for path in (
                 (SOURCES / package / package).joinpath(*end).with_suffix(".py"),
                 (SOURCES / package / package).joinpath(*end, "__init__.py"),
+                # Messages are generated from files.
+                (SOURCES / package).joinpath(*end),
             )
         ), dotted
     for module in re.findall(r"`((?:[a-z_0-9]+/)*(?!my_)[a-z_0-9]+\.py)`", text):
