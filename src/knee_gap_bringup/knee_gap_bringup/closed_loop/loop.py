@@ -20,8 +20,9 @@ from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.messages import fill_gap_estimate
 
-# The simulated clock at the start [s], and the time from an image to its edges in ticks.
-_BEGIN, _LATENCY = 100.0, 1
+# The simulated clock at the start [s]; how long before a tick an image is exposed [s], so that its stamp is
+# that of no other event; and after how many ticks more its edges arrive.
+_BEGIN, _EXPOSED_BEFORE, _LATENCY = 100.0, 0.007, 1
 # A person resets the controller this long after it reported a fault [s].
 _RESET_AFTER = 2.0
 _LEAST_OPENING, _MOST_OPENING = 0.0022, 0.0034
@@ -108,29 +109,25 @@ class ClosedLoop:
         self.resets = 0
         self.heard: list[Heard] = []
         self._rng = rng
-        self._estimator = self._new_estimator()
+        self._estimator: GapEstimator | None = None
         self._message = blank("knee_gap_msgs/msg/GapEstimate")
         self._images: deque[tuple[int, EdgeObservation, LensPose]] = deque()
         self._last: tuple[EdgeObservation, LensPose] | None = None
         self._held_back: list[GapEstimate] = []
         self._overtaken: GapEstimate | None = None
-        self._was_silent = False
         self._fault_since = float("nan")
 
     def advance(self, tick: int) -> None:
         """Let one tick pass: an image, what the estimator makes of it, the controller, the leg."""
         time = tick * TICK
         every = max(1, round(self.settings.image_period / TICK))
-        if tick % every == 0:
-            self._take_image(tick, time)
+        if tick and tick % every == 0:
+            self._take_image(tick, time - _EXPOSED_BEFORE)
         for estimate in self._arriving(self._estimates(tick, time), time):
             self._hear(estimate, time)
         self._obey(self.control.on_time(_BEGIN + time), time)
         self._reset(time)
         self.leg.advance(self.command.opening_rate, TICK)
-
-    def _new_estimator(self) -> GapEstimator:
-        return GapEstimator(EstimatorParameters(**EXACT_SCOPE))
 
     def _take_image(self, tick: int, time: float) -> None:
         stamp_ns = _nanoseconds(time)
@@ -148,18 +145,21 @@ class ClosedLoop:
         """What the estimator publishes at a tick."""
         now_ns = _nanoseconds(time)
         published: list[GapEstimate] = []
-        silent = self.faults.is_present(Fault.SILENT, time)
-        if self._was_silent and not silent:
-            self._estimator = self._new_estimator()
-        self._was_silent = silent
+        if self.faults.is_present(Fault.SILENT, time):
+            self._estimator = None
+            self._images.clear()
+            return []
+        if self._estimator is None:
+            # As a node that was started: it says that it has received nothing yet.
+            self._estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE))
+            published += self._estimator.begin(now_ns)
         while self._images and self._images[0][0] <= tick:
             _, edges, pose = self._images.popleft()
-            if silent:
-                continue
             if not self.faults.is_present(Fault.LOST, time):
                 published += self._estimator.add_pose(pose, now_ns)
             published += self._estimator.add_edges(edges, now_ns)
-        return published if silent else published + self._estimator.advance(now_ns, 0)
+        published += self._estimator.advance(now_ns, 0)
+        return [self._estimator.leaving(one, now_ns) for one in published]
 
     def _arriving(self, published: list[GapEstimate], time: float) -> list[GapEstimate]:
         """What of the published estimates reaches the controller now, and in which order."""
