@@ -5,6 +5,7 @@ import csv
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -219,6 +220,30 @@ def test_csv_holds_every_number(pages: Path, estimates: list[GapEstimate]) -> No
     known = [row for row in rows if row["gap_true"]]
     assert len(known) == 5
     assert float(known[2]["gap_true"]) == pytest.approx(estimates[-1].gap - 1e-4, abs=1e-9)
+
+
+def test_parquet_holds_the_same_numbers(results: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    out = tmp_path / "out"
+    assert command.main([str(results), "--output", str(out), "--parquet", "--frames", "0"]) == 0
+    table = parquet.read_table(out / "results.parquet").to_pydict()
+    with (out / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(table) == list(rows[0])
+    for name, column in table.items():
+        assert ["" if value is None else str(value) for value in column] == [row[name] for row in rows], name
+
+
+def test_without_the_library_parquet_is_refused_in_one_line(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    out = tmp_path / "out"
+    assert command.main([str(results), "--output", str(out), "--parquet"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("report: --parquet needs pyarrow: tools/env uv pip install")
+    assert said.count("\n") == 1
+    assert not out.exists()
 
 
 def test_a_bad_bag_is_one_line_and_the_others_are_reported(

@@ -21,7 +21,8 @@ from knee_gap_core.user_files import shown
 from knee_gap_replay.report.comparison import Truths
 from knee_gap_replay.report.frames import choose_stamps, draw_frames
 from knee_gap_replay.report.page import INDEX_COLUMNS, Content, bag_page, index_page, index_row
-from knee_gap_replay.report.results import Floats, Results, read_results, status_name
+from knee_gap_replay.report.results import Floats, Results, read_results
+from knee_gap_replay.report.table import require_parquet, write_csv, write_parquet
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
 from knee_gap_simulation.errors import SimulationError
 
@@ -64,31 +65,6 @@ def _truth(results: Results, recording: Path, edges_topic: str, most: int) -> tu
     return truth, f"computed of {known} estimates, none of them VALID" if most else "not computed"
 
 
-def write_table(content: Content, path: Path) -> None:
-    """Write a line for each estimate, the numbers by their names in knee_gap_msgs/GapEstimate."""
-    results = content.results
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["stamp_ns", "time", "status", "reason", "track_id", *results.numbers, "gap_true"])
-        columns = [*results.numbers.values(), content.truth]
-        for index, (stamp, time) in enumerate(zip(results.stamps_ns, results.time, strict=True)):
-            writer.writerow(
-                [
-                    int(stamp),
-                    f"{time:.9f}" if np.isfinite(time) else "",
-                    status_name(int(results.status[index])),
-                    results.reasons[index],
-                    int(results.track_ids[index]),
-                    *(_cell(column[index]) for column in columns),
-                ]
-            )
-
-
-def _cell(value: float) -> str:
-    """A number with all its digits; unknown is empty."""
-    return "" if np.isnan(value) else repr(float(value))
-
-
 def _names(paths: Sequence[Path]) -> list[str]:
     """A name for each bag that can be a file's and a link's, all different."""
     names: list[str] = []
@@ -106,6 +82,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _run(arguments: argparse.Namespace) -> int:
     paths, out = [Path(bag) for bag in arguments.bags], Path(arguments.output)
+    if arguments.parquet:
+        require_parquet()
     inputs = [Path(bag) for bag in arguments.input or ()] or paths
     if len(inputs) not in (1, len(paths)):
         raise BagError(f"--input names {len(inputs)} bags for {len(paths)}: give one, or one for each")
@@ -126,7 +104,9 @@ def _run(arguments: argparse.Namespace) -> int:
             failed.append((shown(path), str(error)))
             continue
         (out / f"{name}.html").write_text(bag_page(content), encoding="utf-8")
-        write_table(content, out / f"{name}.csv")
+        write_csv(content, out / f"{name}.csv")
+        if arguments.parquet:
+            write_parquet(content, out / f"{name}.parquet")
         # The pictures are written: many bags must not fill the memory with them.
         contents.append(content._replace(frames=()))
     _write_index(contents, failed, out)
@@ -164,6 +144,9 @@ def _parser() -> Parser:
         help="bag of inputs, for images and truth: one for all, or one for each BAG (the BAG itself)",
     )
     parser.add_argument("--force", action="store_true", help="write into a folder that is not empty")
+    parser.add_argument(
+        "--parquet", action="store_true", help="write the numbers as Parquet as well; needs pyarrow"
+    )
     parser.add_argument("--frames", type=_count, default=6, metavar="N", help="pictures a bag (6)")
     parser.add_argument(
         "--truth", type=_count, default=60, metavar="N", help="estimates whose truth is computed (60)"
