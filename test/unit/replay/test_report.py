@@ -306,6 +306,22 @@ def test_names_of_pages_are_of_one_bag_each_and_safe() -> None:
     assert _names(paths) == ["out", "out-2", "out-2-2", "index-2", "x_y_"]
 
 
+def test_a_message_that_cannot_be_read_costs_only_itself(
+    estimates: list[GapEstimate], tmp_path: Path
+) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/knee_gap/gap", TOPICS["gap"])
+        bag.write_raw("/knee_gap/gap", bytes.fromhex("00010000ffffffff"), BEGIN)
+        strange = fill_gap_estimate(blank(TOPICS["gap"]), estimates[0])
+        strange.status, strange.reason = 200, "a\nb"
+        bag.write("/knee_gap/gap", strange, BEGIN)
+    found = read_results(tmp_path / "bag", "/knee_gap")
+    assert found.causes() == [("number 200", "a\nb", 1)]
+    assert len(found.remarks) == 1
+    assert found.remarks[0].startswith("1 times: a knee_gap_msgs/msg/GapEstimate on /knee_gap/gap")
+    assert command.main([str(tmp_path / "bag"), "--output", str(tmp_path / "out")]) == 0
+
+
 def test_drop_outs_end_with_the_next_valid_estimate(results: Path) -> None:
     found = read_results(results, "/knee_gap").dropouts()
     assert [(round(one.begin, 6), round(one.end, 6), one.images) for one in found] == [

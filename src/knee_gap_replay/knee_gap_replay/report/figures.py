@@ -125,7 +125,10 @@ def _draw_gap(axes: Axes, results: Results, truth: Floats) -> None:
         axes.fill_between(
             time, least, most, color=BLUE, alpha=0.35, lw=0, label="confidence interval", rasterized=is_long
         )
-    axes.plot(time, gap, color=BLUE, lw=1.4, label="gap", rasterized=is_long)
+    # Between others that are not VALID, one estimate makes neither a line nor a band.
+    alone = np.isfinite(gap) & np.isnan(np.roll(gap, 1)) & np.isnan(np.roll(gap, -1))
+    axes.vlines(time[alone], low[alone], high[alone], color=BLUE, alpha=0.3, lw=1.5, rasterized=is_long)
+    axes.plot(time, gap, ".-", color=BLUE, lw=1.4, ms=2, label="gap", rasterized=is_long)
     known = np.isfinite(truth) & np.isfinite(results.time)
     if known.any():
         axes.plot(results.time[known], 1e3 * truth[known], ".", color=ORANGE, ms=4, label="truth")
@@ -163,7 +166,7 @@ def _draw_status(axes: Axes, results: Results) -> None:
 def _draw_snr(axes: Axes, results: Results) -> None:
     snr = np.where(results.valid, results.numbers["snr"], np.nan)
     time, (snr, baseline) = _in_order(results, [snr, results.numbers["baseline"]])
-    axes.plot(time, snr, color=BLUE, lw=1.4, rasterized=_is_long(time))
+    axes.plot(time, snr, ".-", color=BLUE, lw=1.4, ms=2, rasterized=_is_long(time))
     axes.set(ylabel="SNR [-]", xlabel="time [s]")
     axes.set_ylim(bottom=0.0)
     beside = axes.twinx()

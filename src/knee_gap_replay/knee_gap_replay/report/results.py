@@ -23,6 +23,8 @@ Floats = npt.NDArray[np.float64]
 _OTHER_CLOCK_NS = 3_600 * 1_000_000_000
 # A stream pauses where two stamps lie farther apart than this many periods.
 _PAUSE_PERIODS = 1.5
+# Kinds of messages that cannot be read, of which a page speaks.
+_MOST_REMARKS = 5
 _NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")
 
 
@@ -144,12 +146,17 @@ def read_results(path: Path, space: str) -> Results:
     estimates: list[Any] = []
     calibrations: dict[str, Any] = {}
     statuses: Counter[str] = Counter()
+    unreadable: Counter[str] = Counter()
     stamps: dict[str, list[int]] = {gap: [], edges: [], poses: []}
     with BagReader(path) as bag:
         if gap not in bag.topics:
             raise BagError(f"{path} has no topic {gap}: process it first, or name its --namespace")
         for entry in bag.messages([topic for topic in (*stamps, used) if topic in bag.topics]):
-            message = bag.deserialize(entry)
+            try:
+                message = bag.deserialize(entry)
+            except BagError as error:
+                unreadable[str(error)] += 1
+                continue
             if entry.topic == used:
                 calibrations[str(message.node)] = message
                 continue
@@ -159,6 +166,7 @@ def read_results(path: Path, space: str) -> Results:
             elif entry.topic == edges:
                 statuses[_edge_status(int(message.status))] += 1
         remarks = [*([bag.renamed] if bag.renamed else []), *bag.losses]
+    remarks += [f"{count} times: {flaw}" for flaw, count in unreadable.most_common(_MOST_REMARKS)]
     if not estimates:
         raise BagError(f"{path} has no message on {gap}")
     at = np.array(stamps[gap], dtype=np.int64)
