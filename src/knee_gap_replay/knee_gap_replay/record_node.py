@@ -165,18 +165,22 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     writer = WriterThread(bag)
     node = RecordNode(arguments.topics, writer, every=arguments.all)
-    with bag:
-        writer.start()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        end = time.monotonic() + (arguments.duration or float("inf"))
-        try:
-            while not stop.is_set() and time.monotonic() < end and writer.error is None:
-                executor.spin_once(timeout_sec=0.05)
-        finally:
-            writer.finish()
-            node.destroy_node()
-        return _report(node, writer, bag, arguments.out)
+    try:
+        with bag:
+            writer.start()
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            end = time.monotonic() + (arguments.duration or float("inf"))
+            try:
+                while not stop.is_set() and time.monotonic() < end and writer.error is None:
+                    executor.spin_once(timeout_sec=0.05)
+            finally:
+                writer.finish()
+                node.destroy_node()
+    except BagError as error:
+        received = bag.counts.total()
+        raise BagError(f"{error}; of {received} messages those before it are kept and readable") from None
+    return _report(node, writer, bag, arguments.out)
 
 
 def _report(node: RecordNode, writer: WriterThread, bag: BagWriter, out: str) -> int:
