@@ -120,19 +120,21 @@ def _start(job: Job, row: _Row) -> _Running:
 
 def _work(job: Job, connection: Connection) -> None:
     """Process one bag in a process of its own, and send how it went."""
+    # Nobody to tell any more, or an end from outside: the state then says that the bag was begun.
+    with contextlib.suppress(BrokenPipeError, KeyboardInterrupt):
+        connection.send(_outcome(job))
+
+
+def _outcome(job: Job) -> tuple[str, str, dict[str, int], int, int]:
     # Bars of several bags would overwrite each other.
-    with contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stderr(io.StringIO()):
         try:
             result = process_one(job, workers=1)
         except (BagError, ConfigurationError, FileError, OSError) as error:
-            connection.send(("failed", str(error), {}, 0, 0))
-            return
-        except KeyboardInterrupt:
-            return
-    del said
+            return ("failed", str(error), {}, 0, 0)
     remark = result.lines[-1] if result.exit_code else "; ".join(result.lines[:-1])
     valid = sum(count for topic, count in result.counts.items() if topic.endswith("/gap/snr"))
-    connection.send(("failed" if result.exit_code else "done", remark, result.counts, result.losses, valid))
+    return ("failed" if result.exit_code else "done", remark, result.counts, result.losses, valid)
 
 
 def _ended(running: Sequence[_Running]) -> list[_Running]:
