@@ -5,6 +5,7 @@ ament index, or from this source tree where no workspace is set up.
 """
 
 import os
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -82,7 +83,7 @@ def full_name(msgtype: str) -> str:
 
 def blank(msgtype: str) -> Any:
     """Return a default-constructed message of `msgtype`, with the values that rclpy would give it."""
-    return _blank(typestore(), known_type(msgtype))
+    return _maker(msgtype)()
 
 
 def _register(store: Typestore, msgtype: str) -> None:
@@ -120,24 +121,36 @@ def _referenced_types(fields: Any) -> set[str]:
     return names
 
 
-def _blank(store: Typestore, msgtype: str) -> Any:
-    values = {name: _blank_field(store, *field) for name, field in store.fielddefs[msgtype][1]}
-    message = store.types[msgtype](**values)
-    for name, value in _DEFAULTS.get(msgtype, {}).items():
-        setattr(message, name, value)
-    return message
+@cache
+def _maker(msgtype: str) -> Callable[[], Any]:
+    """Return what makes empty messages of a type; values that cannot be changed are made once."""
+    store, name = typestore(), known_type(msgtype)
+    kind = store.types[name]
+    constants: dict[str, Any] = {}
+    makers: list[tuple[str, Callable[[], Any]]] = []
+    for field, (node, value) in store.fielddefs[name][1]:
+        make = _field_maker(node, value)
+        if node == Nodetype.BASE:
+            constants[field] = make()
+        else:
+            makers.append((field, make))
+    constants.update(_DEFAULTS.get(name, {}))
+    return lambda: kind(**constants, **{field: make() for field, make in makers})
 
 
-def _blank_field(store: Typestore, node: int, value: Any) -> Any:
+def _field_maker(node: int, value: Any) -> Callable[[], Any]:
     if node == Nodetype.NAME:
-        return _blank(store, value)
+        return _maker(value)
     if node == Nodetype.BASE:
-        return "" if value[0] in ("string", "wstring") else _numpy_type(value[0]).type(0).item()
+        constant = "" if value[0] in ("string", "wstring") else _numpy_type(value[0]).type(0).item()
+        return lambda: constant
     (item_node, item_value), length = value
     count = length if node == Nodetype.ARRAY else 0
     if item_node == Nodetype.BASE and item_value[0] not in ("string", "wstring"):
-        return np.zeros(count, _numpy_type(item_value[0]))
-    return [_blank_field(store, item_node, item_value) for _ in range(count)]
+        dtype = _numpy_type(item_value[0])
+        return lambda: np.zeros(count, dtype)
+    make = _field_maker(item_node, item_value)
+    return lambda: [make() for _ in range(count)]
 
 
 def _numpy_type(name: str) -> "np.dtype[Any]":
