@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import select
 import sys
 import termios
@@ -12,10 +13,13 @@ from collections.abc import Callable, Iterator
 _ARROWS = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[C": "right"}
 
 
+_KEY = re.compile(rb"\x1b\[[A-D]|[^\x1b]", re.DOTALL)
+
+
 @contextlib.contextmanager
 def keys(press: Callable[[str], None]) -> Iterator[bool]:
     """Call `press` with each key while the context lasts; gives False where there is no terminal to read."""
-    if not sys.stdin or not sys.stdin.isatty() or os.getpgrp() != os.tcgetpgrp(sys.stdin.fileno()):
+    if not _is_ours():
         yield False
         return
     descriptor = sys.stdin.fileno()
@@ -28,7 +32,8 @@ def keys(press: Callable[[str], None]) -> Iterator[bool]:
                 pressed = os.read(descriptor, 16)
                 if not pressed:
                     return
-                press(_ARROWS.get(pressed) or pressed[:1].decode(errors="replace"))
+                for key in _KEY.findall(pressed):
+                    press(_ARROWS.get(key) or key.decode(errors="replace"))
 
     reader = threading.Thread(target=read, name="keyboard", daemon=True)
     tty.setcbreak(descriptor)
@@ -39,3 +44,11 @@ def keys(press: Callable[[str], None]) -> Iterator[bool]:
         ended.set()
         reader.join()
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
+def _is_ours() -> bool:
+    """Whether the standard input is a terminal, and this process in its foreground."""
+    try:
+        return sys.stdin.isatty() and os.getpgrp() == os.tcgetpgrp(sys.stdin.fileno())
+    except (AttributeError, OSError, ValueError):  # closed, or not the terminal of this session
+        return False
