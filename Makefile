@@ -1,13 +1,16 @@
 # knee_gap: two commands, `make demo` and `make test`; both set up whatever is missing.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup anatomy demo test lint bench clean
 
 help: ## show what there is
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
 
 setup: ## set up whatever is missing
 	@tools/setup
+
+anatomy: setup ## add what knees of meshes need (make_bag --anatomy)
+	@tools/env uv pip install -q --require-hashes -r tools/requirements/anatomy.lock
 
 demo: setup ## play the sample bag through the live nodes; results in out/demo
 	@tools/run knee_gap_bringup demo

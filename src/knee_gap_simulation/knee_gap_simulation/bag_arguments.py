@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 
 from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_simulation.anatomy.meshes import UNITS
+from knee_gap_simulation.anatomy.posing import Compartment
 from knee_gap_simulation.calibration.bag import BOARDS, LENSES
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Difficulty
@@ -62,6 +64,17 @@ def bag_parser() -> Parser:
         choices=list(Appearance),
         help="look of a knee: plain, or real, drawn from the seed as arthroscopes show it (plain)",
     )
+    parser.add_argument(
+        "--anatomy",
+        type=Path,
+        metavar="FOLDER",
+        help="a knee of meshes: STL, PLY or OBJ named femur, tibia, medial-meniscus, lateral-meniscus",
+    )
+    parser.add_argument("--mesh-unit", choices=list(UNITS), help="unit of the meshes (m)")
+    parser.add_argument(
+        "--compartment", choices=list(Compartment), help="compartment of that knee to look into (medial)"
+    )
+    parser.add_argument("--flexion-deg", type=finite, help="flexion of that knee (25)")
     parser.add_argument("--no-gap", action="store_true", help="a closed knee, without a gap")
     parser.add_argument("--calibration", action="store_true", help="record a board and pivoting to calibrate")
     parser.add_argument(

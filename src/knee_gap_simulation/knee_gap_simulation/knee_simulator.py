@@ -23,6 +23,8 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from enum import Enum
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,12 +33,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import rigid
+from knee_gap_simulation.anatomy.mapping import MeshMapper
+from knee_gap_simulation.anatomy.mesh_knee import MeshKnee
+from knee_gap_simulation.anatomy.posing import Compartment
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Conditions, Difficulty, conditions
 from knee_gap_simulation.knee.ground_truth import PointObservations, SurfacePoints, follow, surface_points
 from knee_gap_simulation.knee.knee_camera import Dressing, KneeCamera, KneeLight
 from knee_gap_simulation.knee.probe import Probe
 from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.looks.dressing import dressing
 from knee_gap_simulation.looks.look import Appearance, Look
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
@@ -51,6 +57,8 @@ from knee_gap_simulation.surfaces.instrument_gap import InstrumentGap
 
 # Least distance of the scope from any surface [m].
 LEAST_CLEARANCE = 0.0006
+# Flexion at which a compartment is looked into, if none is given [rad].
+DEFAULT_FLEXION = float(np.radians(25.0))
 
 
 class Draw(Enum):
@@ -85,6 +93,16 @@ class SimulatorFrame:
 
 
 @dataclass(frozen=True)
+class Anatomy:
+    """A knee of meshes: their folder and unit, the compartment looked into, and the flexion [rad]."""
+
+    folder: Path
+    unit: str = "m"
+    compartment: str = Compartment.MEDIAL
+    flexion: float = DEFAULT_FLEXION
+
+
+@dataclass(frozen=True)
 class SimulatorSettings:
     """Settings of a simulation. Lengths [m], times [s]. ``gap`` None: a closed joint."""
 
@@ -99,6 +117,7 @@ class SimulatorSettings:
     media: Media = IN_SALINE
     portal: float | None = None
     appearance: Appearance = Appearance.PLAIN
+    anatomy: Anatomy | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Settings as plain values for JSON; those that were not given are left out."""
@@ -109,6 +128,10 @@ class SimulatorSettings:
             del values["portal"]
         if self.appearance is Appearance.PLAIN:
             del values["appearance"]
+        if self.anatomy is None:
+            del values["anatomy"]
+        else:
+            values["anatomy"]["folder"] = str(self.anatomy.folder)
         return values
 
 
@@ -132,12 +155,14 @@ class KneeSimulator:
         calibrated_in: Medium | None = None,
         portal: float | None = None,
         appearance: str = Appearance.PLAIN,
+        anatomy: Anatomy | None = None,
     ) -> None:
         """Lengths [m]. ``difficulty`` sets single levels by name; the result is the same for any ``workers``.
 
         The knee is filled with ``medium``; ``bench.lens`` is the lens in it, ``Lens()`` the lens in
         ``calibrated_in`` (the same by default). ``portal``: distance from the tip back to the pivot of the
         scope, as in `HandMotion`. ``appearance`` "real" draws the look from the seed.
+        ``anatomy`` is a knee of meshes instead of a drawn one.
 
         Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
         that does not fit into the joint.
@@ -174,10 +199,9 @@ class KneeSimulator:
             media=Media(medium if calibrated_in is None else calibrated_in, medium),
             portal=portal,
             appearance=Appearance(appearance),
+            anatomy=anatomy,
         )
-        self.scene = KneeScene.random(self.settings.gap, seed, self.conditions.roughness)
-        if self.look is not None:
-            self.scene = self.look.shaped(self.scene, travel)
+        self.scene: KneeShape = self._shape()
         self.lens, self.scope = RefractedLens.of(lens, self.settings.media.ratio), Scope()
         self.T_world_scene = world_from_scene(seed)
         self._workers = workers
@@ -202,7 +226,9 @@ class KneeSimulator:
         A frame's geometry, noise and debris do not depend on the range. Its exposure does, since it is
         controlled from frame to frame.
         """
-        camera = KneeCamera(self.scene, self.lens, self.conditions, self.settings.seed, self._dressing())
+        scene = self.scene
+        mapper = partial(MeshMapper, scene) if isinstance(scene, MeshKnee) else None
+        camera = KneeCamera(scene, self.lens, self.conditions, self.settings.seed, self._dressing(), mapper)
         indices = range(start, self.frame_count if stop is None else min(stop, self.frame_count), step)
         with ThreadPoolExecutor(self._workers) as pool:
             ahead: deque[tuple[int, Future[KneeLight]]] = deque()
@@ -259,6 +285,15 @@ class KneeSimulator:
     def tracked_body_poses(self) -> tuple[Array, Array, Array]:
         """Times (n,) [s] at 120 Hz, reported body poses and true lens poses (n, 4, 4) in the world."""
         return self._body_times, self._bodies, self._true_lenses()
+
+    def _shape(self) -> KneeShape:
+        settings = self.settings
+        if (anatomy := settings.anatomy) is not None:
+            return MeshKnee(
+                anatomy.folder, anatomy.unit, Compartment(anatomy.compartment), anatomy.flexion, settings.gap
+            )
+        scene = KneeScene.random(settings.gap, settings.seed, self.conditions.roughness)
+        return scene if self.look is None else self.look.shaped(scene, settings.travel)
 
     def _dressing(self) -> Dressing | None:
         if self.look is None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.user_files import flaw_of_new
+from knee_gap_core.user_files import FileError, flaw_of_new
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.bag_arguments import bag_parser
@@ -24,7 +24,7 @@ from knee_gap_simulation.calibration.bag import (
 )
 from knee_gap_simulation.calibration.scene import RotatedScope
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator
+from knee_gap_simulation.knee_simulator import FROM_SEED, Anatomy, KneeSimulator
 from knee_gap_simulation.looks.look import Appearance
 from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
@@ -264,6 +264,22 @@ def _knee(arguments: argparse.Namespace) -> KneeSimulator:
         calibrated_in=arguments.calibrated_in,
         portal=_portal(arguments),
         appearance=arguments.appearance or Appearance.PLAIN,
+        anatomy=_anatomy(arguments),
+    )
+
+
+def _anatomy(arguments: argparse.Namespace) -> Anatomy | None:
+    if arguments.anatomy is None:
+        if arguments.mesh_unit or arguments.compartment or arguments.flexion_deg is not None:
+            raise SimulationError("--mesh-unit, --compartment and --flexion-deg are for --anatomy")
+        return None
+    defaults = Anatomy(arguments.anatomy)
+    flexion = arguments.flexion_deg
+    return Anatomy(
+        arguments.anatomy,
+        arguments.mesh_unit or defaults.unit,
+        arguments.compartment or defaults.compartment,
+        defaults.flexion if flexion is None else float(np.radians(flexion)),
     )
 
 
@@ -299,6 +315,10 @@ def _calibration(arguments: argparse.Namespace) -> CalibrationRecording:
         arguments.calibrated_in,
         arguments.portal_mm,
         arguments.appearance,
+        arguments.anatomy,
+        arguments.mesh_unit,
+        arguments.compartment,
+        arguments.flexion_deg,
     )
     if arguments.no_gap or arguments.difficulty or any(value is not None for value in others):
         raise SimulationError(
@@ -332,7 +352,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     of_rims = (
         turned or arguments.scope_of is not None or (arguments.video_delay_ms and not arguments.calibration)
     )
-    of_a_knee = arguments.difficulty or arguments.no_gap or arguments.travel_direction or arguments.appearance
+    of_meshes = (arguments.anatomy, arguments.mesh_unit, arguments.compartment, arguments.flexion_deg)
+    of_a_knee = (
+        arguments.difficulty
+        or arguments.no_gap
+        or arguments.travel_direction
+        or arguments.appearance
+        or any(value is not None for value in of_meshes)
+    )
     try:
         if (arguments.board or arguments.lens) and not arguments.calibration:
             raise SimulationError("--board and --lens are for --calibration")
@@ -348,7 +375,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))
-    except (SimulationError, BagError, OSError) as error:
+    except (SimulationError, BagError, FileError, OSError) as error:
         print(f"make_bag: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

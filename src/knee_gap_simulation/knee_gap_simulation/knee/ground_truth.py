@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import inverse
-from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_simulation.surfaces.distance_field import CONDYLE, MENISCUS, PROBE
 
@@ -69,7 +69,7 @@ class PointObservations(NamedTuple):
 
 
 def surface_points(
-    scene: KneeScene,
+    scene: KneeShape,
     lens: Lens,
     T_world_scene: Array,
     T_world_lens: Array,
@@ -85,7 +85,7 @@ def surface_points(
 
 
 def follow(
-    scene: KneeScene,
+    scene: KneeShape,
     lens: Lens,
     T_world_scene: Array,
     T_world_lens: Array,
@@ -119,7 +119,7 @@ def follow(
     return PointObservations(pixels, visibility, offsets[:, 0], offsets[:, 1], kinds)
 
 
-def nearest_edge(scene: KneeScene, lens: Lens, T_scene_lens: Array, pixel: Array) -> tuple[Array, EdgeKind]:
+def nearest_edge(scene: KneeShape, lens: Lens, T_scene_lens: Array, pixel: Array) -> tuple[Array, EdgeKind]:
     """Distance ([px], [rad]) from a pixel to the nearest edge of the gap, negative inside, and its kind."""
     angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -149,7 +149,7 @@ def nearest_edge(scene: KneeScene, lens: Lens, T_scene_lens: Array, pixel: Array
     return sign * np.array([far[best], angle]), kind
 
 
-def _kind(scene: KneeScene, lens: Lens, T_scene_lens: Array, tissue_side: Array, gap_side: Array) -> EdgeKind:
+def _kind(scene: KneeShape, lens: Lens, T_scene_lens: Array, tissue_side: Array, gap_side: Array) -> EdgeKind:
     bearings = lens.bearings(np.stack([tissue_side, gap_side]))
     _, _, surfaces, lengths = scene.cast(T_scene_lens[:3, 3], bearings @ T_scene_lens[:3, :3].T, exact=False)
     # If the surface continues behind the edge, it is the edge of a shadow.

@@ -12,6 +12,7 @@ from knee_gap_simulation.knee.difficulty import Conditions
 from knee_gap_simulation.knee.fluid import Debris, Turbidity
 from knee_gap_simulation.knee.ray_casting import NOTHING, SurfaceMapper
 from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape, Mapper
 from knee_gap_simulation.knee.tissues import knee_textures
 from knee_gap_simulation.scope.imaging import ByteImage, FloatImage
 from knee_gap_simulation.scope.lens import Lens
@@ -58,12 +59,14 @@ class KneeCamera:
 
     def __init__(
         self,
-        scene: KneeScene,
+        scene: KneeShape,
         lens: Lens,
         conditions: Conditions,
         seed: int,
         dressing: Dressing | None = None,
+        mapper: Callable[[Array], Mapper] | None = None,
     ) -> None:
+        """``mapper`` makes what finds the surfaces behind bearings, for a scene that is no `KneeScene`."""
         self._scene, self._lens, self._conditions = scene, lens, conditions
         self._dressing = dressing
         stop = lens.field_stop() if dressing is None else dressing.stop
@@ -78,7 +81,12 @@ class KneeCamera:
         centre = np.array([lens.centre_x_px, lens.centre_y_px])
         self._bearings = lens.bearings(centre + offset * shrink[..., None])
         self._inside = np.isfinite(self._bearings[..., 0])
-        self._mapper = SurfaceMapper(scene, self._bearings)
+        self._mapper: Mapper
+        if mapper is not None:
+            self._mapper = mapper(self._bearings)
+        else:
+            assert isinstance(scene, KneeScene)
+            self._mapper = SurfaceMapper(scene, self._bearings)
         self._textures = knee_textures(seed, conditions.contrast) if dressing is None else dressing.textures
         self._light = (
             dressing.light

@@ -7,7 +7,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.knee.camera_head import CameraHead
 from knee_gap_simulation.knee.difficulty import Conditions
 from knee_gap_simulation.knee.knee_camera import Dressing
-from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.looks.border import Surround, field_border
 from knee_gap_simulation.looks.clutter import Clutter
 from knee_gap_simulation.looks.look import Look
@@ -17,7 +17,7 @@ from knee_gap_simulation.scope.imaging import FloatImage
 from knee_gap_simulation.scope.lens import Lens
 
 
-def dressing(look: Look, scene: KneeScene, lens: Lens, conditions: Conditions, poses: Array) -> Dressing:
+def dressing(look: Look, scene: KneeShape, lens: Lens, conditions: Conditions, poses: Array) -> Dressing:
     """The look's part of the camera; ``poses`` (n, 4, 4) are lens poses in the scene along its travel."""
     border = field_border(lens, look)
     surround = Surround(lens, look, border.stop)

@@ -1,7 +1,7 @@
 """Ground truth of a simulated recording: surface points behind pixels, edges and instrument gaps."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,10 +11,13 @@ import numpy.typing as npt
 from knee_gap_core.user_files import json_value
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.rigid_transforms import inverse
+from knee_gap_simulation.anatomy.mesh_knee import KIND as MESHES
+from knee_gap_simulation.anatomy.mesh_knee import MeshKnee
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.probe import Probe
 from knee_gap_simulation.knee.scene import KIND as KNEE
 from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.recordings.section_truth import (
     SectionTruth,
     edges_at_section,
@@ -42,7 +45,7 @@ class SceneTruth:
     `lens` is the lens in use; `media` are those of its calibration and use.
     """
 
-    scene: RimScene | KneeScene
+    scene: RimScene | KneeShape
     T_world_scene: Array
     lens: Lens
     scope: Scope
@@ -59,10 +62,10 @@ class SceneTruth:
         """
         bearings = self.lens.bearings(np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
         T_scene_lens = self._lens_in_scene(T_world_lens)
-        if isinstance(self.scene, KneeScene):
-            points = self.scene.surface_points(T_scene_lens, bearings, self._rods(stamp_ns))
-        else:
+        if isinstance(self.scene, RimScene):
             points = self.scene.surface_points(T_scene_lens, bearings)
+        else:
+            points = self.scene.surface_points(T_scene_lens, bearings, self._rods(stamp_ns))
         return np.asarray(points @ self.T_world_scene[:3, :3].T + self.T_world_scene[:3, 3])
 
     def gap_mask(self, T_world_lens: npt.ArrayLike, stamp_ns: int | None = None) -> npt.NDArray[np.bool_]:
@@ -71,10 +74,10 @@ class SceneTruth:
         seen = np.isfinite(bearings[..., 0])
         mask = np.zeros(seen.shape, bool)
         T_scene_lens = self._lens_in_scene(T_world_lens)
-        if isinstance(self.scene, KneeScene):
-            mask[seen] = self.scene.looks_into_gap(T_scene_lens, bearings[seen], self._rods(stamp_ns))
-        else:
+        if isinstance(self.scene, RimScene):
             mask[seen] = self.scene.looks_into_gap(T_scene_lens, bearings[seen])
+        else:
+            mask[seen] = self.scene.looks_into_gap(T_scene_lens, bearings[seen], self._rods(stamp_ns))
         return mask
 
     def instrument_gap(
@@ -166,16 +169,20 @@ def scene_from_metadata(metadata: Mapping[str, str]) -> SceneTruth:
         raise SimulationError(
             f"the bag's metadata have no scene under '{METADATA_KEY}': it is not simulated"
         ) from None
-    if values.get("format") != 1 or kind not in (RIMS, KNEE):
+    scenes: dict[str, Callable[[Mapping[str, Any]], RimScene | KneeShape]] = {
+        RIMS: RimScene.from_dict,
+        KNEE: KneeScene.from_dict,
+        MESHES: MeshKnee.from_dict,
+    }
+    if values.get("format") != 1 or kind not in scenes:
         raise SimulationError(
-            f"the scene '{kind}' of format {values.get('format')} is unknown; known: {RIMS}, {KNEE}, format 1"
+            f"the scene '{kind}' of format {values.get('format')} is unknown; "
+            f"known: {', '.join(scenes)}, format 1"
         )
     try:
         media = Media(*values.get("media", IN_SALINE))
-        scene: RimScene | KneeScene
-        scene = (RimScene if kind == RIMS else KneeScene).from_dict(values["scene"])
         return SceneTruth(
-            scene=scene,
+            scene=scenes[kind](values["scene"]),
             T_world_scene=np.array(values["T_world_scene"], dtype=np.float64).reshape(4, 4),
             lens=RefractedLens.of(Lens(**values["lens"]), media.ratio),
             scope=Scope.from_dict(values["scope"]),

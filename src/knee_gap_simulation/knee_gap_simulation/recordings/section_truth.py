@@ -9,13 +9,13 @@ from scipy.spatial import cKDTree
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.knee.scene import KneeScene
+from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_simulation.surfaces.instrument_gap import CONE, InstrumentGap, TissuePoints, instrument_gap
 from knee_gap_simulation.surfaces.tissue_samples import LOWER_SIDE, UPPER_SIDE, TissueSamples
 
-Scene = RimScene | KneeScene
+Scene = RimScene | KneeShape
 
 # Distance from the plane of the section within which tissue counts for the nearest distance of the sides [m].
 NEAR_SECTION = 0.5e-3
@@ -36,7 +36,8 @@ class SectionTruth(NamedTuple):
     edge_points (2, 3): the points that the edges' viewing rays touch. instrument: the instrument gap.
     along_view: the same with the axis along the direction of view. edge_distance: between the edge points.
     across_view: that distance across the view, (r0 + r1) sin(half the angle between the edges) with the
-    ranges r. nearest_distance: the least between the two sides within ``NEAR_SECTION`` of the section.
+    ranges r. nearest_distance: the least between the two sides within ``NEAR_SECTION`` of the section, NaN if
+    one of them is not there.
     """
 
     edge_points: Array
@@ -222,4 +223,6 @@ def _nearest_sides(scene: Scene, edges: Array, view: Array) -> float:
     normal /= np.linalg.norm(normal)
     near = np.abs((samples.points - edges[0]) @ normal) <= NEAR_SECTION
     upper, lower = (samples.points[near & (samples.sides == side)] for side in (UPPER_SIDE, LOWER_SIDE))
+    if not (len(upper) and len(lower)):
+        return float("nan")
     return float(cKDTree(upper).query(lower)[0].min())
