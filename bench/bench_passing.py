@@ -87,8 +87,14 @@ class Run:
 
 def is_passed(estimates: Sequence[GapEstimate], diameter: float) -> bool:
     """Whether the example controller passes an instrument of a diameter [m] on any of the estimates."""
-    control = LegControl(LegParameters(instrument_diameter=diameter, largest_gap=diameter + 0.01))
-    for estimate in estimates:
+    parameters = LegParameters(instrument_diameter=diameter, largest_gap=diameter + 0.01)
+    control = LegControl(parameters, -np.inf)
+    for k, estimate in enumerate(estimates):
+        if k == 0:
+            # A leg at rest before the track begins.
+            nothing = Estimate(False, 0, 0.02, np.nan, np.nan, np.nan, stamp_ns=estimate.stamp_ns - 10**8)
+            for _ in range(2):
+                control.on_estimate(nothing, 1e-9 * nothing.stamp_ns)
         heard = Estimate(
             is_valid=estimate.status is GapStatus.VALID,
             track_id=estimate.track_id,

@@ -49,12 +49,14 @@ class Fuzz:
     def __init__(self, rng: np.random.Generator, messages: int, counts: Counter[str]) -> None:
         self.random = iter(rng.random(24 * messages + 64).tolist())
         self.messages, self.counts = messages, counts
-        self.control = LegControl(PARAMETERS)
         self.now, self.clock = 100.0, 5000.0
+        self.control = LegControl(PARAMETERS, self.now)
         self.gap = self.start = 0.002 + 0.006 * next(self.random)
-        self.rate, self.moved_until = 0.0, -math.inf
+        # Until the controller started, another one may have moved the leg.
+        self.rate, self.moved_until = 0.0, self.now
         # For how long the leg has opened in this step, and since the last word [s].
         self.in_step = self.since_word = 0.0
+        self.last_word = -math.inf
         self.track, self.track_began = 1, 99.0
         self.old: list[Message] = []
         self.heard: dict[int, float] = {}
@@ -63,6 +65,8 @@ class Fuzz:
         self.stated: dict[int, Estimate] = {}
         self.latched = False
         self.acceptable: Message | None = None
+        if next(self.random) < 0.7:
+            self.start_at_rest()
         self.kinds: list[Callable[[Message], Message]] = [
             lambda m: m._replace(estimate=m.estimate._replace(gap=math.nan)),
             lambda m: m._replace(estimate=m.estimate._replace(gap_min=-0.001)),
@@ -82,6 +86,14 @@ class Fuzz:
                 estimate=m.estimate._replace(track_id=max(1, self.track - 1 - int(3 * next(self.random))))
             ),
         ]
+
+    def start_at_rest(self) -> None:
+        """The controller started long ago, and was told that there is no track before the first one began."""
+        self.control = LegControl(PARAMETERS, self.now - 2.0)
+        assert self.control.on_time(self.now - 0.2).measure_again  # type: ignore[union-attr]
+        lost = Estimate(False, 0, 0.02, math.nan, math.nan, math.nan, stamp_ns=-1)
+        self.control.on_estimate(lost, self.now - 0.02)
+        self.moved_until, self.last_word, self.track_began = self.now - 1.0, self.now - 0.02, self.now - 0.5
 
     def play(self) -> None:
         """Let messages, silences, publishers and persons come in any order."""
@@ -162,16 +174,21 @@ class Fuzz:
         self.greatest_ns = max(self.greatest_ns, estimate.stamp_ns)
         if estimate.track_id and estimate.stamp_ns == self.greatest_ns:
             self.of_image_ns = estimate.stamp_ns
-        self.since_word = 0.0
+        silent = self.now - self.last_word > PARAMETERS.deadline
+        self.since_word, self.last_word = 0.0, self.now
         # A track from before the leg moved measures a joint that is no more; inside its step it goes on.
         moving = self.rate > 0.0
         if not moving and message.began < self.moved_until:
             acceptable = False
         if moving and self.acceptable and self.acceptable.estimate.track_id != estimate.track_id:
             acceptable = False
-        # A number that was made up is as old as when it was first heard of.
-        heard = self.heard.setdefault(estimate.track_id, self.now)
-        if not moving and estimate.track_id != self.track and heard < self.moved_until:
+        # A number that was made up is as old as when it was first heard of; after silence its age is unknown.
+        heard = self.heard.setdefault(estimate.track_id, -math.inf if silent else self.now)
+        if (
+            not moving
+            and (estimate.track_id != self.track or heard == -math.inf)
+            and heard < self.moved_until
+        ):
             acceptable = False
         self.old.append(message)
         self.acceptable = message if acceptable else None

@@ -23,8 +23,12 @@ MOST_AHEAD = 0.05
 TICK = 0.02
 # Tracks remembered by the time of their first image; the oldest are forgotten.
 MOST_TRACKS = 4096
+# A request for a new track may be lost, or its service may be missing: time between requests [s] while the
+# old track continues, and number of requests after which that is a fault.
+REQUEST_PERIOD = 0.5
+MOST_REQUESTS = 10
 
-ANEW = "the joint has moved since this track began"
+ANEW = "the joint may have moved since this track began"
 
 
 class Action(StrEnum):
@@ -184,18 +188,23 @@ class LegControl:
     `on_estimate` takes each estimate, `on_time` the time at least every `TICK`, `on_publishers` the
     publishers of the gap; `now` is a monotonic time [s]. A contradiction is kept in `fault`, and the leg is
     held, until `reset`.
+
+    At its start the leg is taken as moved until then, as after a step: another controller may have moved it.
+    A track whose begin was not received is never acted on: the first one, and the first after silence.
     """
 
-    def __init__(self, parameters: LegParameters) -> None:
+    def __init__(self, parameters: LegParameters, now: float) -> None:
         self.parameters = parameters
         self.fault = ""
         # End of the opening step, its track, and end of coming to rest; None if the leg is at rest.
         self._opens_until: float | None = None
         self._step_track = 0
-        self._rests_from: float | None = None
+        self._rests_from: float | None = now + parameters.settling
         # Time since which the leg is at rest, and time of the first image of each track.
-        self._at_rest_since = -float("inf")
+        self._at_rest_since = float("inf")
         self._first_image: dict[int, float] = {}
+        # Requests for a new track since the last new one, and the time of the latest.
+        self._requests, self._requested = 0, -float("inf")
         # The estimate with the latest stamp, and the latest stamp of an estimate with a track.
         self._latest: Estimate | None = None
         self._image_ns: int | None = None
@@ -206,8 +215,8 @@ class LegControl:
 
     def on_estimate(self, estimate: Estimate, now: float) -> Command:
         """Command for an estimate received at `now`."""
-        self._heard = now
         self._note_track(estimate, now)
+        self._heard = now
         contradiction = fault_of(estimate) or self._contradiction(estimate)
         # The stamp of an estimate without a track can be slightly later than that of the next image.
         overtaken = self._latest is not None and estimate.stamp_ns < self._latest.stamp_ns
@@ -226,7 +235,8 @@ class LegControl:
             return self._inside_step(command, estimate, now)
         if not self._first_image.get(estimate.track_id, float("nan")) >= self._at_rest_since:
             # Also if the time of the first image is unknown.
-            command = hold(ANEW) if estimate.is_valid else command
+            return self._request_again(command, estimate, now)
+        self._requests = 0
         if command.action is Action.OPEN:
             opening = min(self.parameters.opening_step, _time_to_limit(estimate, self.parameters))
             self._opens_until, self._step_track = now + opening, estimate.track_id
@@ -236,7 +246,7 @@ class LegControl:
         """Command due to the passing of time, None if there is none: end of a step, or no estimate."""
         if self._opens_until is not None and now >= self._opens_until:
             return self._stop(now, "the step is over")
-        if self._heard is None or now - self._heard > self.parameters.deadline:
+        if self._is_silent(now):
             return self.on_silence(now)
         return self._while_held(now)
 
@@ -275,6 +285,7 @@ class LegControl:
         self._publisher = next(iter(self._publishers), None)
         self._latest = self._image_ns = None
         self._sequence = -1
+        self._requests = 0
         self._stop(now, "")
         return ""
 
@@ -299,15 +310,31 @@ class LegControl:
         if now < self._rests_from:
             return hold("the leg is coming to rest")
         self._at_rest_since, self._rests_from = self._rests_from, None
-        return hold("the joint has moved: measuring the gap again")._replace(measure_again=True)
+        self._requests, self._requested = 1, now
+        return hold("the joint may have moved: measuring the gap again")._replace(measure_again=True)
+
+    def _request_again(self, command: Command, estimate: Estimate, now: float) -> Command:
+        """Hold the leg for an estimate of an old track; request a new one again if the old one continues."""
+        command = hold(ANEW) if estimate.is_valid else command
+        if estimate.track_id == 0 or now - self._requested < REQUEST_PERIOD:
+            return command
+        if self._requests >= MOST_REQUESTS:
+            return self.on_fault(f"no new track after {self._requests} requests to measure again", now)
+        self._requests, self._requested = self._requests + 1, now
+        return command._replace(measure_again=True)
 
     def _note_track(self, estimate: Estimate, now: float) -> None:
-        """Store the time of the first received image of a track."""
+        """Store the time of the first image of a track; NaN if it may have begun unnoticed."""
         if estimate.track_id and estimate.track_id not in self._first_image:
             if len(self._first_image) >= MOST_TRACKS:
                 del self._first_image[next(iter(self._first_image))]
             # A stamp in the future does not make a track newer.
-            self._first_image[estimate.track_id] = now - max(estimate.age, 0.0)
+            first = float("nan") if self._is_silent(now) else now - max(estimate.age, 0.0)
+            self._first_image[estimate.track_id] = first
+
+    def _is_silent(self, now: float) -> bool:
+        """Whether no estimate was received within the deadline."""
+        return self._heard is None or now - self._heard > self.parameters.deadline
 
     def _contradiction(self, estimate: Estimate) -> str:
         """How an estimate contradicts those before it; empty if it does not."""

@@ -8,6 +8,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegControl, LegParameters, hold
@@ -27,10 +28,11 @@ class LegControllerNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("leg_controller_node", health=self.health)
-        self._control = LegControl(self.declare(LegParameters))
+        self._control = LegControl(self.declare(LegParameters), time.monotonic())
         self.refuse_unknown_parameters()
         self._command = hold("no estimate received yet")
         self._measure_again = self.create_client(Trigger, "restart")
+        self._requested: Future[Trigger.Response] | None = None
         self._rate = self.create_publisher(TwistStamped, "leg/command", RESULT_QOS)
         self.create_service(Trigger, "~/reset", self.on_reset)
         qos = QoSProfile(
@@ -95,10 +97,12 @@ class LegControllerNode(BaseNode):
         except Exception as error:  # the leg is held whatever went wrong
             command = self._control.on_fault(f"the controller failed: {error!r}", time.monotonic())
         if command.measure_again:
-            # Without a response the leg is held: the old track is not used any more.
-            self._measure_again.call_async(Trigger.Request())
+            # Without a response the leg is held, and the core requests it again: the old track is not used.
+            if self._requested is not None and not self._requested.done():
+                self._measure_again.remove_pending_request(self._requested)
+            self._requested = self._measure_again.call_async(Trigger.Request())
         self.log(command)
-        # The request is sent once, even if the command is repeated.
+        # A repeated command repeats no request.
         self._command = command._replace(measure_again=False)
         message = TwistStamped()
         message.header.stamp = self.get_clock().now().to_msg()

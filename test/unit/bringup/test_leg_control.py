@@ -1,5 +1,6 @@
 """The example controller never moves on a guess."""
 
+import itertools
 import math
 
 import fuzz_leg_control
@@ -7,7 +8,9 @@ import pytest
 
 from knee_gap_bringup.leg_control import (
     INTERVALS,
+    MOST_REQUESTS,
     MOST_TRACKS,
+    REQUEST_PERIOD,
     STATUS_VALID,
     Action,
     Estimate,
@@ -50,6 +53,14 @@ REFUSED = {
 }
 
 
+def at_rest(parameters=PARAMETERS, now=10.0):
+    """A controller that has started, has requested a new track, and was told that there is none yet."""
+    control = LegControl(parameters, now - 2.0)
+    assert control.on_time(now - 0.2).measure_again
+    control.on_estimate(LOST._replace(stamp_ns=-(10**6)), now - 0.1)
+    return control
+
+
 def images(*estimates):
     """The same, as images one after the other."""
     return [estimate._replace(stamp_ns=1 + index) for index, estimate in enumerate(estimates)]
@@ -60,12 +71,12 @@ def test_holds_on_what_the_rules_refuse(estimate) -> None:
     command = decide(estimate, PARAMETERS)
     assert command.action is Action.HOLD
     assert command.opening_rate == 0.0
-    assert LegControl(PARAMETERS).on_estimate(estimate, 10.0).action is Action.HOLD
+    assert at_rest().on_estimate(estimate, 10.0).action is Action.HOLD
 
 
 @pytest.mark.parametrize("estimate", [*FAULTY.values(), *REFUSED.values()], ids=[*FAULTY, *REFUSED])
 def test_inside_a_step_the_same_rules_stop_it_at_once(estimate) -> None:
-    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    control = at_rest(LegParameters(opening_step=5.0, settling=0.3))
     first, bad, good = images(NARROW, estimate, NARROW)
     assert control.on_estimate(first, 10.0).opening_rate > 0.0
     assert control.on_estimate(bad, 10.1).opening_rate == 0.0
@@ -74,7 +85,7 @@ def test_inside_a_step_the_same_rules_stop_it_at_once(estimate) -> None:
 
 @pytest.mark.parametrize("estimate", FAULTY.values(), ids=FAULTY)
 def test_what_contradicts_itself_holds_the_leg_until_a_person_resets_it(estimate) -> None:
-    control = LegControl(LegParameters(settling=0.3))
+    control = at_rest(LegParameters(settling=0.3))
     bad, *good = images(estimate, *[NARROW._replace(track_id=9)] * 4)
     control.on_estimate(bad, 10.0)
     assert control.fault
@@ -87,7 +98,7 @@ def test_what_contradicts_itself_holds_the_leg_until_a_person_resets_it(estimate
 
 @pytest.mark.parametrize("estimate", REFUSED.values(), ids=REFUSED)
 def test_what_is_merely_refused_needs_no_person(estimate) -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     refused, good = images(estimate, NARROW)
     assert control.on_estimate(refused, 10.0).action is Action.HOLD
     assert not control.fault
@@ -107,14 +118,14 @@ def test_what_is_merely_refused_needs_no_person(estimate) -> None:
     ids=["other bounds", "another track", "lost and valid at once", "time back", "lost in the past"],
 )
 def test_messages_that_contradict_each_other_hold_the_leg(second) -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
     assert control.on_estimate(second, 10.1).action is Action.HOLD
     assert control.fault
 
 
 def test_the_same_message_again_is_no_contradiction() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     for estimate in (NARROW, LOST._replace(stamp_ns=2)):
         control.on_estimate(estimate, 10.0)
         control.on_estimate(estimate, 10.1)
@@ -122,7 +133,7 @@ def test_the_same_message_again_is_no_contradiction() -> None:
 
 
 def test_an_image_behind_a_statement_of_silence_waits_and_needs_no_person() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     control.on_estimate(LOST._replace(stamp_ns=100_000_000), 10.0)
     assert control.on_estimate(NARROW._replace(stamp_ns=90_000_000), 10.0).action is Action.HOLD
     assert control.on_estimate(NARROW._replace(stamp_ns=110_000_000), 10.1).action is Action.OPEN
@@ -132,7 +143,7 @@ def test_an_image_behind_a_statement_of_silence_waits_and_needs_no_person() -> N
 
 
 def test_a_second_publisher_holds_the_leg_as_long_as_it_is_there() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     assert control.on_publishers(frozenset({"a"}), 10.0) is None
     assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
     assert control.on_publishers(frozenset({"a", "b"}), 10.1).action is Action.HOLD
@@ -148,7 +159,7 @@ def test_a_second_publisher_holds_the_leg_as_long_as_it_is_there() -> None:
 
 
 def test_numbers_of_two_publishers_are_found_before_their_names_are() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     ours, others, again = images(*[NARROW] * 3)
     assert control.on_estimate(ours._replace(sequence=70), 10.0).action is Action.OPEN
     assert control.on_estimate(others._replace(sequence=3), 10.1).action is Action.HOLD
@@ -157,7 +168,7 @@ def test_numbers_of_two_publishers_are_found_before_their_names_are() -> None:
 
 
 def test_a_fault_of_the_controller_itself_holds_the_leg() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     assert control.on_estimate(NARROW, 10.0).action is Action.OPEN
     assert control.on_fault("something failed", 10.1).opening_rate == 0.0
     assert control.on_estimate(NARROW._replace(stamp_ns=9, track_id=9), 20.0).action is Action.HOLD
@@ -192,8 +203,8 @@ def test_settings_that_contradict_each_other_are_refused(settings, words) -> Non
 
 
 def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
-    control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
-    first, moving, over, during, at_rest, later, late, again, open_again = images(
+    control = at_rest(LegParameters(opening_step=0.5, settling=0.3, deadline=1.0), now=0.0)
+    first, moving, over, during, resting_leg, later, late, again, open_again = images(
         NARROW,
         NARROW,
         NARROW,
@@ -205,7 +216,7 @@ def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
     assert control.on_estimate(moving, 0.4).action is Action.OPEN
     assert control.on_estimate(over, 0.5).action is Action.HOLD
     assert control.on_estimate(during, 0.7).action is Action.HOLD
-    resting = control.on_estimate(at_rest, 0.85)
+    resting = control.on_estimate(resting_leg, 0.85)
     assert resting.action is Action.HOLD
     assert resting.measure_again
     assert control.on_estimate(later, 1.0).action is Action.HOLD
@@ -215,14 +226,14 @@ def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
 
 
 def test_while_the_joint_moves_not_even_that_the_instrument_fits_counts() -> None:
-    control = LegControl(LegParameters(opening_step=0.5, settling=0.3))
+    control = at_rest(LegParameters(opening_step=0.5, settling=0.3), now=0.0)
     first, fits = images(NARROW, WIDE)
     assert control.on_estimate(first, 0.0).action is Action.OPEN
     assert control.on_estimate(fits, 0.1).action is Action.HOLD
 
 
 def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_came_after() -> None:
-    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
     assert control.on_time(0.1).action is Action.HOLD
     assert control.on_time(0.45).measure_again
@@ -233,14 +244,14 @@ def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_ca
 
 
 def test_time_alone_ends_a_step() -> None:
-    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
     assert control.on_time(0.09) is None
     assert control.on_time(0.1).opening_rate == 0.0
 
 
 def test_a_step_is_shorter_where_the_limit_is_nearer() -> None:
-    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    control = at_rest(LegParameters(opening_step=5.0, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW._replace(gap_max=0.0119), 0.0).action is Action.OPEN
     assert control.on_time(0.099) is None
     assert control.on_time(0.101).opening_rate == 0.0
@@ -252,7 +263,7 @@ def test_a_leg_that_does_not_move_needs_no_time_to_its_limit() -> None:
 
 
 def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
-    control = LegControl(LegParameters(opening_step=5.0, settling=0.3))
+    control = at_rest(LegParameters(opening_step=5.0, settling=0.3), now=0.0)
     first, *after = images(*[NARROW] * 4)
     assert control.on_estimate(first, 0.0).opening_rate > 0.0
     assert control.on_time(0.19) is None
@@ -263,7 +274,7 @@ def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
 
 
 def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
-    control = LegControl(LegParameters(opening_step=0.1, settling=0.3))
+    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
     first, over, silent, old = images(NARROW, NARROW, LOST, NARROW)
     assert control.on_estimate(first, 0.0).opening_rate > 0.0
     assert control.on_estimate(over, 0.1).action is Action.HOLD
@@ -271,8 +282,53 @@ def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
     assert control.on_estimate(old, 0.6).action is Action.HOLD
 
 
+def test_a_controller_that_starts_acts_on_no_track_that_may_have_begun_before() -> None:
+    control = LegControl(LegParameters(settling=0.3), 10.0)
+    running = images(*[WIDE] * 40)
+    # It starts, and hears of the track at once, or only after it has come to rest: both are of before.
+    assert control.on_estimate(running[0], 10.1).action is Action.HOLD
+    assert control.on_estimate(running[1], 10.35).measure_again
+    late = LegControl(LegParameters(settling=0.3), 10.0)
+    assert late.on_time(10.35).measure_again
+    for k in range(30):
+        assert late.on_estimate(running[2 + k], 11.0 + 0.016 * k).action is Action.HOLD
+    assert late.on_estimate(running[39]._replace(track_id=2), 11.6).action is Action.PASS
+
+
+def test_a_track_whose_begin_was_not_received_is_not_acted_on() -> None:
+    control = at_rest()
+    unknown, again, fresh = images(WIDE, WIDE, WIDE._replace(track_id=2))
+    # 0.3 s of silence: the track may have begun at any time of it.
+    assert control.on_estimate(unknown, 10.3).action is Action.HOLD
+    assert control.on_estimate(again, 10.4).action is Action.HOLD
+    assert control.on_estimate(fresh, 10.5).action is Action.PASS
+
+
+def test_a_new_track_is_requested_until_one_comes_and_not_for_ever() -> None:
+    control = LegControl(PARAMETERS, 10.0)
+    requested, now, k = [], 10.5, 0
+    while not control.fault and now < 30.0:
+        k, now = k + 1, now + 0.016
+        if control.on_estimate(WIDE._replace(stamp_ns=k), now).measure_again:
+            requested.append(now)
+    assert len(requested) == MOST_REQUESTS
+    assert min(b - a for a, b in itertools.pairwise(requested)) >= REQUEST_PERIOD
+    assert "no new track after 10 requests" in control.fault
+    # A person's reset requests again.
+    assert control.reset(now) == ""
+    assert control.on_estimate(WIDE._replace(stamp_ns=k + 1), now + 0.6).measure_again
+    assert control.on_estimate(WIDE._replace(stamp_ns=k + 2, track_id=2), now + 0.7).action is Action.PASS
+
+
+def test_no_new_track_is_requested_while_there_is_none() -> None:
+    control = at_rest()
+    for k in range(1000):
+        assert not control.on_estimate(LOST._replace(stamp_ns=k), 10.0 + 0.016 * k).measure_again
+    assert not control.fault
+
+
 def test_memory_is_bounded_however_many_tracks_come() -> None:
-    control = LegControl(PARAMETERS)
+    control = at_rest()
     for number in range(1, 3 * MOST_TRACKS):
         control.on_estimate(
             NARROW._replace(track_id=number, stamp_ns=number, is_valid=False), 10.0 + 0.001 * number
