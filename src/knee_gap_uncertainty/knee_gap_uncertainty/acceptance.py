@@ -147,6 +147,15 @@ def _is_short(estimate: GapEstimate, facts: Facts) -> bool:
     return estimate.baseline < max(limits.least_baseline, limits.least_baseline_share * facts.distance)
 
 
+def _contradicts_bounds(estimate: GapEstimate) -> bool:
+    """Whether numbers that are known lie outside their bounds."""
+    pairs = (
+        (estimate.gap, estimate.gap_min, estimate.gap_max),
+        (estimate.point_distance, estimate.point_distance_min, estimate.point_distance_max),
+    )
+    return any(value < low or value > high for value, low, high in pairs)
+
+
 RULES: tuple[Rule, ...] = (
     # The image and its stamp.
     Rule(Reason.FAULT, GapStatus.UNKNOWN, lambda f: bool(f.fault), detail=lambda f: f.fault),
@@ -253,8 +262,13 @@ class Verdict(NamedTuple):
 
 
 def judge(facts: Facts) -> Verdict | None:
-    """The first rule that the facts break; None where they break none."""
+    """The first rule that the facts break; None where they break none.
+
+    Lower bounds are not kept, whichever rule comes first, if the estimate from all views contradicts them.
+    """
     for rule in RULES:
         if rule.is_broken(facts):
-            return Verdict(rule.status, Rejection(rule.reason, rule.detail(facts)), rule.kept)
+            disagree = facts.measured is not None and _contradicts_bounds(facts.measured)
+            kept = Kept.NOTHING if disagree else rule.kept
+            return Verdict(rule.status, Rejection(rule.reason, rule.detail(facts)), kept)
     return None

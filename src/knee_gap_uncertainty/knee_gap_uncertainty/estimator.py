@@ -68,6 +68,8 @@ class GapEstimator:
         self._rotation_reported = False
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
+        # Until a track shows that the tracked body does not creep, and again after one that motion has ended.
+        self._suspects_creep = True
         self._leg = LegBody(self.parameters.max_pose_age) if self.parameters.leg_motion > 0.0 else None
         # Where the leg body was when the track began.
         self._leg_at_first: LensPose | None = None
@@ -292,10 +294,16 @@ class GapEstimator:
             self._leg_at_first = self._leg.pose if self._leg is not None else None
             columns = edges.camera_errors.shape[-1]
             self._track = Track(
-                edges.track_id, pose.frame_id, self.parameters, self._calibration_error, columns
+                edges.track_id,
+                pose.frame_id,
+                self.parameters,
+                self._calibration_error,
+                columns,
+                self._suspects_creep,
             )
         try:
             estimate = self._track.add(edges, pose)
+            self._suspects_creep = self._track.suspects_creep
         except (MeasurementError, ArithmeticError, ValueError) as error:
             self._track = None
             verdict = judge(Facts(self.parameters, error=error))

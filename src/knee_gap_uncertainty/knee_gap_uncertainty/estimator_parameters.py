@@ -145,12 +145,28 @@ class EstimatorParameters:
             "range": (0.0, 0.01),
         },
     )
+    unproven_drift: float = field(
+        default=0.4e-3,
+        metadata={
+            "description": "the same, per axis, until a track has shown that the body does not creep: a "
+            "loose clamp slips a millimetre a second; 0 takes tracker_drift from the start [m/s]",
+            "range": (0.0, 0.01),
+        },
+    )
     tracker_angular_drift: float = field(
         default=1e-4,
         metadata={
             "description": "RMS rate at which the tracked body turns on the scope: a third of a degree a "
             "minute [rad/s]",
             "range": (0.0, 0.1),
+        },
+    )
+    tracker_scale: float = field(
+        default=0.01,
+        metadata={
+            "description": "relative standard error of the tracker's lengths: of a wand that nobody measured "
+            "again; no image shows it [-]",
+            "range": (0.0, 0.2),
         },
     )
     clock_error: float = field(

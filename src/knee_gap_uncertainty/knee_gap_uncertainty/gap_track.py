@@ -66,8 +66,11 @@ class Track:
         parameters: EstimatorParameters,
         calibration: CalibrationError,
         camera_columns: int = 0,
+        suspects_creep: bool = False,
     ) -> None:
-        self._calibration = calibration
+        self._calibration = self._stated = calibration
+        # Whether no track has shown yet that the tracked body does not creep, or motion has ended one since.
+        self.suspects_creep = suspects_creep
         self._camera_columns = camera_columns
         # Edges that state no error of their camera have that of one which nobody calibrated.
         self._camera_error = calibration.camera if camera_columns else parameters.camera_error
@@ -79,7 +82,7 @@ class Track:
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
         self._direction = np.full(3, np.nan)
-        self._joint_motion = JointMotionTest()
+        self._joint_motion = JointMotionTest(parameters.tracker_drift, parameters.unproven_drift)
         self._section = SectionInView(parameters.longest_unseen_edges)
         self.ended = False
         # The last image that was found still, where the window does not keep it.
@@ -127,6 +130,7 @@ class Track:
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
             return self._contradicted(blank, finding)
+        self._admit_creep()
         self._passing = None if self._window.add(view.view) else view.view
         blank = replace(blank, view_count=len(self._window))
         if fitted is None:
@@ -164,6 +168,14 @@ class Track:
         corrected = shared.taken_from(views)
         return corrected, self._fitted(corrected)[0], passing
 
+    def _admit_creep(self) -> None:
+        """While creep is suspected, admit the largest rate that the views leave possible."""
+        rate = (
+            self._joint_motion.largest_rate / self._parameters.tracker_bound if self.suspects_creep else 0.0
+        )
+        self.suspects_creep = rate > self._stated.drift
+        self._calibration = replace(self._stated, drift=max(rate, self._stated.drift))
+
     def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
         if len(views) < FEWEST_VIEWS:
@@ -176,6 +188,7 @@ class Track:
     def _contradicted(self, blank: GapEstimate, finding: Finding) -> GapEstimate:
         """No number from an image whose points are not where the track has them; the track may end here."""
         self.ended = finding is Finding.MOVED
+        self.suspects_creep = self.suspects_creep or self.ended
         self.situation = None
         return self._refused(blank, Facts(self._parameters, finding=finding))
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from travelling_scope import TINY, travelling
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.acceptance import RULES, Facts, Kept, Reason, judge
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -48,6 +48,18 @@ def test_each_reason_has_one_rule_and_nothing_is_broken_by_nothing_known() -> No
     assert GapStatus.VALID not in {rule.status for rule in RULES}
     assert judge(Facts(TINY)) is None
     assert all(rule.kept is Kept.NOTHING for rule in RULES if rule.status is GapStatus.UNKNOWN)
+
+
+@pytest.mark.parametrize(("gap", "kept"), [(0.004, Kept.LOWER_BOUNDS), (0.002, Kept.NOTHING)])
+def test_no_lower_bound_is_kept_that_the_estimate_contradicts(gap: float, kept: Kept) -> None:
+    """An earlier rule with lower bounds does not hide that the numbers contradict each other."""
+    measured = GapEstimate(
+        1, "world", GapStatus.VALID, gap=gap, gap_min=0.003, gap_max=0.005, baseline=1.0,
+        point_distance=0.004, point_distance_min=0.003, point_distance_max=0.005,
+    )  # fmt: skip
+    verdict = judge(Facts(TINY, at_border=True, measured=measured, still_count=9))
+    assert verdict is not None
+    assert (verdict.rejection.reason, verdict.kept) == (Reason.AT_BORDER, kept)
 
 
 def test_counts_stay_bounded_whatever_is_wrong_with_edges_and_poses() -> None:

@@ -219,6 +219,8 @@ def test_point_that_slips_along_its_ray_is_told_by_the_leg_body_only() -> None:
                 **EXACT_SCOPE,
                 leg_motion=0.5e-3 if watched else 0.0,
                 tracker_drift=0.0,
+                unproven_drift=0.0,
+                tracker_scale=0.0,
                 tracker_angular_drift=0.0,
             )
             estimates = scope.estimates(GapEstimator(parameters))

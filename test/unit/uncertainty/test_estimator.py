@@ -88,7 +88,9 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
 
 
 def test_bounds_are_those_of_the_first_and_the_present_view() -> None:
-    parameters = replace(EXACT, tracker_drift=0.0, tracker_angular_drift=0.0)
+    parameters = replace(
+        EXACT, tracker_drift=0.0, tracker_angular_drift=0.0, unproven_drift=0.0, tracker_scale=0.0
+    )
     estimate = run(GapEstimator(parameters), list(np.linspace(0.0, 0.005, 11)))[-1]
     first, now = edges(0, 0.0), edges(0, 0.005)
     expected = gap_range(

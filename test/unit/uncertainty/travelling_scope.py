@@ -126,7 +126,9 @@ def estimates(
 
 
 # Errors far below any tracker's: only the rules stand between a short travel and VALID.
-TINY = EstimatorParameters(**EXACT_SCOPE, tracker_drift=0.0, tracker_angular_drift=0.0)
+TINY = EstimatorParameters(
+    **EXACT_SCOPE, tracker_drift=0.0, tracker_angular_drift=0.0, unproven_drift=0.0, tracker_scale=0.0
+)
 
 
 def travelling(

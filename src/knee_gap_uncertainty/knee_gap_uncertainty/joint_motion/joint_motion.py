@@ -8,6 +8,7 @@ from enum import Enum
 
 import numpy as np
 
+from knee_gap_uncertainty.joint_motion.creep import DEVIATIONS
 from knee_gap_uncertainty.joint_motion.motion_statistics import (
     LARGEST_PRESENT,
     MotionStatistics,
@@ -24,6 +25,8 @@ FEWEST_CONTRADICTIONS = 5
 LARGEST_FIRST = 19.8
 # Fewer than 1 track in 100 of 600 images exceeds it by chance, by simulation: see `joint_motion_table`.
 LARGEST_SHIFT = 26.0
+# Of a rate, in deviations of what is known and admitted of it, with 3 degrees of freedom.
+LARGEST_CREEP = 20.0
 
 
 class Finding(Enum):
@@ -41,7 +44,11 @@ class JointMotionTest:
     the start, its path crosses the true one now and then.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, admitted_rate: float = 0.0, unproven_rate: float = 0.0) -> None:
+        """Rates [m/s] at which the tracked body may creep: RMS length, and per axis before any view."""
+        self._rates = (admitted_rate, unproven_rate)
+        # Rate [m/s] along the baseline that the views leave possible, if the tracked body creeps.
+        self.largest_rate = DEVIATIONS * unproven_rate
         # Images found still.
         self.still_count = 0
         self._doubts = 0
@@ -58,10 +65,11 @@ class JointMotionTest:
             observed = Observations(
                 *(np.concatenate([a[:-1], b, a[-1:]]) for a, b in zip(observed, between, strict=True))
             )
-        return self.decide(motion_statistics(observed, fitted))
+        return self.decide(motion_statistics(observed, fitted, self._rates))
 
     def decide(self, found: MotionStatistics) -> Finding:
         """Finding at the present view from its statistics."""
+        self.largest_rate = found.largest_rate
         if found.present > LARGEST_PRESENT:
             self._doubts += 1
             # A young track is no better founded than what contradicts it.
@@ -72,7 +80,7 @@ class JointMotionTest:
             return Finding.CONTRADICTION
         self._doubts = 0
         moved = found.first > LARGEST_FIRST or found.shift > LARGEST_SHIFT
-        if moved:
+        if moved or found.creep > LARGEST_CREEP:
             return Finding.MOVED
         self.still_count += 1
         return Finding.STILL

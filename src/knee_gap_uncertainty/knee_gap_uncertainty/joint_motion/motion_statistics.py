@@ -1,8 +1,9 @@
 """How far the residuals of a track are from those of two points that stand still.
 
-Three statistics, all of them chi-square with 2 degrees of freedom where nothing moved. `present`: how far a
-bearing of the present view lies from where the earlier views put it; `first`: the same of the view that
-carries A0; `shift`: score test for a point that jumped sideways after view k, at its greatest over k. An
+Four statistics, chi-square with 2 degrees of freedom, the last with 3, where nothing moved. `present`: how
+far a bearing of the present view lies from where the earlier views put it; `first`: the same of the view that
+carries A0; `shift`: score test for a point that jumped sideways after view k, at its greatest over k;
+`creep`: score test for both points that move at a constant rate. An
 offset common to all bearings in the axes of the image is estimated along: a calibration error is no motion.
 From the second view on the rays are tested to meet, at a depth that an arthroscope can look at.
 """
@@ -13,6 +14,7 @@ import numpy as np
 
 from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
+from knee_gap_uncertainty.joint_motion.creep import DEVIATIONS, creep_statistic
 from knee_gap_uncertainty.joint_motion.offset_equations import (
     Normal,
     Scratch,
@@ -48,16 +50,21 @@ FEWEST_VIEWS_TO_SCALE = 10
 
 
 class MotionStatistics(NamedTuple):
-    """The three statistics [-], and after which view (0 is the first) the shift came, -1 where untested."""
+    """The statistics [-], and after which view (0 is the first) the shift came, -1 where untested.
+
+    `largest_rate` [m/s] along the baseline that the views leave possible, if the tracked body may creep.
+    """
 
     present: float
     first: float
     shift: float
     shift_after: int
+    creep: float = 0.0
+    largest_rate: float = float("nan")
 
 
 class Observations(NamedTuple):
-    """The arrays of N views, as in likelihood.Measured."""
+    """The arrays of N views, as in likelihood.Measured; `times` (N,) [s] are 0 where they are not known."""
 
     lens: Array
     bearings: Array
@@ -65,6 +72,7 @@ class Observations(NamedTuple):
     lens_covariances: Array
     rotation_covariances: Array
     lens_axes: Array
+    times: Array
 
 
 def observations(views: Views) -> Observations:
@@ -76,27 +84,36 @@ def observations(views: Views) -> Observations:
         views.lens_covariances,
         views.rotation_covariances,
         views.lens_axes,
+        np.zeros(len(views)) if views.times is None else views.times,
     )
 
 
-def motion_statistics(observed: Observations, fitted: MultiViewFit | None) -> MotionStatistics:
+def motion_statistics(
+    observed: Observations, fitted: MultiViewFit | None, rates: tuple[float, float] = (0.0, 0.0)
+) -> MotionStatistics:
     """Statistics of views, the last of which is the present one; all zero for a single view.
 
-    `fitted`: a fit over most of them, None where there is none.
+    `fitted`: a fit over most of them, None where there is none; `rates` [m/s]: RMS rate of the creep that
+    is no contradiction, and deviation per axis of the creep of a body of which nothing is known.
     """
     count = len(observed.lens)
     if count < 2:
-        return MotionStatistics(0.0, 0.0, 0.0, -1)
+        return MotionStatistics(0.0, 0.0, 0.0, -1, 0.0, DEVIATIONS * rates[1])
     trusted = fitted is not None and count >= FEWEST_VIEWS_TO_TRUST_A_FIT
     if fitted is not None and trusted and np.isfinite(fitted.unknowns).all():
-        measured = Measured(*observed, fitted.centre, fitted.frames)
+        measured = Measured(*observed[:-1], fitted.centre, fitted.frames)
         deviations = np.sqrt(np.diag(fitted.unknowns_covariance)[[2, 5]])
         nearest = np.minimum(NEAREST, fitted.unknowns[:, 2] + 2.0 * deviations)
-        return MotionStatistics(*statistics_of_arrays(measured, fitted.unknowns, nearest, 1))
+        return MotionStatistics(
+            *statistics_of_arrays(measured, fitted.unknowns, nearest, 1, observed.times, rates)
+        )
     centre = observed.lens[:-1].mean(axis=0)
-    measured = Measured(*observed, centre, mean_frames(observed.bearings[:-1]))
+    measured = Measured(*observed[:-1], centre, mean_frames(observed.bearings[:-1]))
     start = np.array([[0.0, 0.0, EXPECTED_INVERSE_DEPTH]] * 2)
-    return MotionStatistics(*statistics_of_arrays(measured, start, np.full(2, NEAREST), PASSES_WITHOUT_TRUST))
+    nearest = np.full(2, NEAREST)
+    return MotionStatistics(
+        *statistics_of_arrays(measured, start, nearest, PASSES_WITHOUT_TRUST, observed.times, rates)
+    )
 
 
 def warm_up() -> None:
@@ -127,8 +144,8 @@ def _admit_near_points(measured: Measured, nearest: Array, unknowns: Array, lens
 
 @compiled
 def statistics_of_arrays(
-    measured: Measured, start: Array, nearest: Array, passes: int
-) -> tuple[float, float, float, int]:
+    measured: Measured, start: Array, nearest: Array, passes: int, times: Array, rates: tuple[float, float]
+) -> tuple[float, float, float, int, float, float]:
     """MotionStatistics on plain arrays, by `passes` Gauss-Newton steps over the earlier views.
 
     `nearest` (2,): inverse depths [1/m] that the weights must allow for.
@@ -161,7 +178,7 @@ def statistics_of_arrays(
         for i in range(last):
             add(out, i, 1.0, scratch, normal)
         if not invert(normal, covariance):
-            return 0.0, 0.0, 0.0, -1
+            return 0.0, 0.0, 0.0, -1, 0.0, DEVIATIONS * rates[1]
         step = covariance @ normal.score
         for k in range(6):
             unknowns[k // 3, k % 3] += step[k]
@@ -179,22 +196,24 @@ def statistics_of_arrays(
     if last >= FEWEST_VIEWS_TO_SCALE:
         scale = min(max(cost / (4.0 * last - 6.0), 1.0), LARGEST_SCALE)
     if not invert(normal, covariance):
-        return 0.0, 0.0, 0.0, -1
+        return 0.0, 0.0, 0.0, -1, 0.0, DEVIATIONS * rates[1]
     present = _prediction(out, last, normal, covariance) / scale
     if present > LARGEST_PRESENT or last < FEWEST_VIEWS_BESIDE_A_SHIFT:
-        return present, 0.0, 0.0, -1
+        return present, 0.0, 0.0, -1, 0.0, DEVIATIONS * rates[1]
 
     add(out, last, 1.0, scratch, normal)
     cost += _squared(out, last)
     add(out, 0, -weights[0], scratch, normal)
     if not invert(normal, covariance):
-        return present, 0.0, 0.0, -1
+        return present, 0.0, 0.0, -1, 0.0, DEVIATIONS * rates[1]
     first = _prediction(out, 0, normal, covariance) / scale
     add(out, 0, weights[0], scratch, normal)
     if not invert(normal, covariance):
-        return present, first, 0.0, -1
+        return present, first, 0.0, -1, 0.0, DEVIATIONS * rates[1]
     shift, after = _largest_shift(out, weights, normal, covariance, cost)
-    return present, first, shift, after
+    baseline = measured.lens[last] - measured.lens[0]
+    creep, rate = creep_statistic(out, times, baseline, unknowns, weights, normal, covariance, rates)
+    return present, first, shift, after, creep / scale, rate
 
 
 @compiled

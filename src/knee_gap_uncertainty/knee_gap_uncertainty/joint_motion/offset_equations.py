@@ -58,7 +58,7 @@ def start_from_prior(out: Linearised, unknowns: Array, normal: Normal) -> None:
 
 
 @compiled
-def _weigh(out: Linearised, i: int, weight: float, scratch: Scratch) -> None:
+def weigh(out: Linearised, i: int, weight: float, scratch: Scratch) -> None:
     """Write W A and W r of a view, A (4, 10) being the derivative of its bearings by all ten unknowns."""
     weighted, pull = scratch.weighted, scratch.pull
     weighted[:, :] = 0.0
@@ -76,7 +76,7 @@ def _weigh(out: Linearised, i: int, weight: float, scratch: Scratch) -> None:
 @compiled
 def add(out: Linearised, i: int, weight: float, scratch: Scratch, normal: Normal) -> None:
     """Add a view, `weight` times, to the normal equations."""
-    _weigh(out, i, weight, scratch)
+    weigh(out, i, weight, scratch)
     for row in range(4):
         n, axis = row // 2, row % 2
         normal.score[6 + row] += scratch.pull[row]
@@ -92,7 +92,7 @@ def add(out: Linearised, i: int, weight: float, scratch: Scratch, normal: Normal
 @compiled
 def add_sideways(out: Linearised, i: int, weight: float, scratch: Scratch, shifted: Normal) -> None:
     """Add a view to the four rows (4, 10) of the normal equations that belong to both points' a and b."""
-    _weigh(out, i, weight, scratch)
+    weigh(out, i, weight, scratch)
     for row in range(4):
         n, axis = row // 2, row % 2
         for k in range(2):

@@ -104,6 +104,7 @@ def shared_error(reported: Iterable[ScopeCalibration], parameters: EstimatorPara
         camera=0.0 if used else parameters.camera_error,
         drift=parameters.tracker_drift,
         angular_drift=parameters.tracker_angular_drift,
+        scale=parameters.tracker_scale,
     )
 
 
@@ -114,6 +115,7 @@ class CalibrationError:
     `camera` [-] is the relative error of a focal length that was not calibrated; the views themselves carry
     what it does, as it depends on where a point lies in the picture. `drift` [m/s] and `angular_drift`
     [rad/s] are RMS lengths of the rates at which the lens creeps on the tracked body from the first view on.
+    `scale` [-] is the relative error of all distances between positions of the lens.
     """
 
     covariance: Array
@@ -121,6 +123,7 @@ class CalibrationError:
     camera: float = 0.0
     drift: float = 0.0
     angular_drift: float = 0.0
+    scale: float = 0.0
 
     def widened(self, fit: MultiViewFit, views: Views) -> MultiViewFit:
         """The fit with the shared error in its covariances and in the common part of its shares.
@@ -147,13 +150,14 @@ class CalibrationError:
         seconds = 1e-9 * (present.stamp_ns - first.stamp_ns)
         angle = np.sqrt(np.trace(turn) + turned + seen**2 + (self.angular_drift * seconds) ** 2)
         crept = self.drift * seconds / 2.0
-        position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late + crept**2)
+        scaled = self.scale * (present.lens - first.lens) / 2.0
+        position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late + crept**2 + scaled @ scaled)
         return factor * float(angle), factor * float(position)
 
     def root(self, count: int) -> Array:
         """(count, count) whose product with its transpose is the covariance of all shared errors.
 
-        They are shift, rotation and clock, and then those of the camera and the drift, of a variance of 1.
+        They are shift, rotation and clock, and then those of camera, drift and scale, of a variance of 1.
         """
         root = np.eye(count)
         values, vectors = np.linalg.eigh(self.covariance)
@@ -162,7 +166,7 @@ class CalibrationError:
         return root
 
     def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
-        """(6, 7 + k + 6): how far the estimated points go with shift, rotation, clock, camera and drift.
+        """(6, 7 + k + 7): how far the points go with shift, rotation, clock, camera, drift and scale.
 
         By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
         moves all lenses alike moves the points with them, and their distance not at all.
@@ -171,7 +175,7 @@ class CalibrationError:
         motions = _motions(views)
         by_camera = _camera_errors(views)
         camera = slice(7, 7 + by_camera.shape[-1])
-        count = camera.stop + 6
+        count = camera.stop + 7
         moved = np.zeros((6, count))
         lens_moved = np.zeros((len(views), 3, count))
         lens_moved[:, :, :3] = rotations - rotations[-1]
@@ -181,7 +185,8 @@ class CalibrationError:
         turned[:, :, 6] = motions[:, 3:]
         crept = rotations * _seconds(views)[:, None, None] / np.sqrt(3.0)
         lens_moved[:, :, camera.stop : camera.stop + 3] = self.drift * (crept - crept[-1])
-        turned[:, :, camera.stop + 3 :] = self.angular_drift * crept
+        turned[:, :, camera.stop + 3 : camera.stop + 6] = self.angular_drift * crept
+        lens_moved[:, :, camera.stop + 6] = self.scale * (views.lens_positions - views.lens_positions[-1])
         lens_variance = np.trace(views.lens_covariances, axis1=1, axis2=2) / 3.0
         rotation_variance = np.trace(views.rotation_covariances, axis1=1, axis2=2) / 3.0
         for n in range(2):

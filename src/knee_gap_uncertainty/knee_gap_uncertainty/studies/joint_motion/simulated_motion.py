@@ -89,6 +89,7 @@ def simulate(situation: Situation, image_count: int, rng: np.random.Generator) -
             isotropic_covariances(image_count, LENS_ERROR),
             isotropic_covariances(image_count, ROTATION_ERROR),
             lens_rotations=rotations_seen,
+            times=np.arange(image_count) / 60.0,
         ),
         event_at,
     )

@@ -1,0 +1,91 @@
+"""Score test for points that move at a constant rate against the lens: a body that creeps on its scope.
+
+A body that creeps makes the lens appear at A + c t in place of A, with one rate c (3,) [m/s]: the same as
+both points creeping by c t. Where the speed of the scope varies over the track, and where it turns back, that
+is no other depth of the points, and the residuals show it. Where the scope moves uniformly nothing of it
+shows: then the largest rate that the views leave possible is large.
+"""
+
+import numpy as np
+
+from knee_gap_core.compiled import compiled
+from knee_gap_core.values.arrays import Array
+from knee_gap_uncertainty.joint_motion.offset_equations import Normal, Scratch, weigh
+from knee_gap_uncertainty.multi_view.likelihood import Linearised
+from knee_gap_uncertainty.numerics.small_matrix import cholesky, solve_factored
+
+# Of the information on a rate, so that a direction of which nothing is known has an inverse.
+RIDGE = 1e-6
+TINY = 1e-9  # [m/s]
+# What is possible is that many deviations.
+DEVIATIONS = 3.0
+
+
+@compiled
+def creep_statistic(
+    out: Linearised,
+    times: Array,
+    baseline: Array,
+    unknowns: Array,
+    weights: Array,
+    normal: Normal,
+    covariance: Array,
+    rates: tuple[float, float],
+) -> tuple[float, float]:
+    """Statistic of a rate, and the largest rate along the baseline that the views leave possible [m/s].
+
+    The statistic is the squared length of the rate in deviations of its estimate and of what is admitted,
+    chi-square with 3 degrees of freedom. Admitted are a rate of the RMS length `rates[0]` [m/s], and errors
+    of the bearings that grow over the track as creep does; `rates[1]` [m/s] is the deviation of a rate, per
+    axis, before any view. `times` (N,) [s]; `normal`, with all views, and its inverse are of both points.
+    """
+    count = times.size
+    span = times[count - 1] - times[0]
+    length = np.sqrt(np.sum(baseline * baseline))
+    if not (span > 0.0 and length > 0.0):
+        return 0.0, DEVIATIONS * rates[1]
+    score, information, cross = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 10))
+    scratch = Scratch(np.zeros((4, 10)), np.zeros(4))
+    slopes, weighted = np.zeros((4, 3)), np.zeros((4, 3))
+    image_variance = 0.0
+    for i in range(count):
+        weigh(out, i, weights[i], scratch)
+        for row in range(4):
+            n, axis = row // 2, row % 2
+            image_variance += out.image_covariances[i, n, axis, axis] / (4.0 * count)
+            for k in range(3):
+                slopes[row, k] = -unknowns[n, 2] * out.lens_jacobians[i, n, axis, k] * (times[i] - times[0])
+        for row in range(4):
+            for k in range(3):
+                weighted[row, k] = 0.0
+                for column in range(4):
+                    weighted[row, k] += weights[i] * out.weights[i, row, column] * slopes[column, k]
+        for k in range(3):
+            for row in range(4):
+                score[k] += slopes[row, k] * scratch.pull[row]
+                for column in range(3):
+                    information[k, column] += slopes[row, k] * weighted[row, column]
+                for column in range(10):
+                    cross[k, column] += slopes[row, k] * scratch.weighted[row, column]
+    reach = cross @ covariance
+    left = score - reach @ normal.score
+    known = information - reach @ cross.T
+    nearest = max(abs(unknowns[0, 2]), abs(unknowns[1, 2]), 1.0)
+    admitted = rates[0] ** 2 / 3.0 + image_variance / (nearest * span) ** 2
+    total = known + admitted * (known @ known)
+    for k in range(3):
+        total[k, k] += RIDGE * information[k, k]
+    factor, solution, spread = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    if not cholesky(total, factor):
+        return 0.0, DEVIATIONS * rates[1]
+    solve_factored(factor, left, solution)
+    statistic = np.sum(left * solution)
+    for k in range(3):
+        known[k, k] += 1.0 / max(rates[1], TINY) ** 2
+    if not cholesky(known, factor):
+        return statistic, DEVIATIONS * rates[1]
+    along = baseline / length
+    solve_factored(factor, left, solution)
+    solve_factored(factor, along, spread)
+    rate = abs(np.sum(solution * along)) + DEVIATIONS * np.sqrt(np.sum(spread * along))
+    return statistic, rate
