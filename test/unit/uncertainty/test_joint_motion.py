@@ -197,6 +197,7 @@ def test_statistics_do_not_depend_on_the_frame() -> None:
         turn @ views.lens_covariances @ turn.T,
         turn @ views.rotation_covariances @ turn.T,
         lens_rotations=turn @ views.lens_rotations,
+        times=views.times,
     )
     here = motion_statistics(observations(views), fit(views))
     there = motion_statistics(observations(elsewhere), fit(elsewhere))

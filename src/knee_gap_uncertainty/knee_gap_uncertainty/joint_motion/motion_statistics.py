@@ -212,7 +212,7 @@ def statistics_of_arrays(
         return present, first, 0.0, -1, 0.0, DEVIATIONS * rates[1]
     shift, after = _largest_shift(out, weights, normal, covariance, cost)
     baseline = measured.lens[last] - measured.lens[0]
-    creep, rate = creep_statistic(out, times, baseline, unknowns, weights, normal, covariance, rates)
+    creep, rate = creep_statistic(out, times, baseline, unknowns, weights, normal, rates)
     return present, first, shift, after, creep / scale, rate
 
 
