@@ -1,7 +1,7 @@
 # knee_gap: two commands, `make demo` and `make test`; both set up whatever is missing.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup anatomy demo test lint bench clean
+.PHONY: help setup anatomy demo test lint bench faults clean
 
 help: ## show what there is
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
@@ -26,6 +26,9 @@ lint: setup ## ruff, mypy
 
 bench: setup ## measure speed and memory, as ratios against named floors and rivals
 	@tools/env python bench/bench.py
+
+faults: setup ## do to the live nodes what happens in an operating room, and print what came of it
+	@tools/env python bench/bench_live_faults.py
 
 clean: ## remove everything that was set up, built or written
 	rm -rf .venv build install log out
