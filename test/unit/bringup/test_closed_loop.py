@@ -89,6 +89,24 @@ def test_the_leg_opens_by_steps_and_is_measured_again() -> None:
     assert {1, 2} <= tracks
 
 
+def test_the_joint_is_not_opened_where_it_may_be_at_its_limit() -> None:
+    leg = LegParameters(instrument_diameter=0.004, largest_gap=0.0045)
+    closed = ClosedLoop(replace(small(0.004), leg=leg))
+    upper, begun = [], 0
+    for tick in range(round(2.6 / TICK)):
+        before = closed.command.action
+        closed.advance(tick)
+        if closed.heard and closed.heard[-1].is_valid:
+            upper.append(closed.heard[-1].gap_max)
+        if closed.command.action is Action.OPEN and before is not Action.OPEN:
+            begun += 1
+            assert upper[-1] < leg.largest_gap
+    # Wider bounds came first, and held the leg.
+    assert max(upper) > leg.largest_gap
+    assert begun
+    assert closed.leg.opening < leg.largest_gap
+
+
 @pytest.mark.parametrize("fault", [Fault.STALE, Fault.SILENT])
 def test_the_leg_is_held_while_nothing_is_heard(fault: Fault) -> None:
     closed = ClosedLoop(small(0.004, fault))
