@@ -103,5 +103,6 @@ class OpeningKnee:
 
     def _scene(self, opening: float) -> KneeScene:
         scene = self._simulator.scene
+        assert isinstance(scene, KneeScene)  # a knee of meshes is not opened by a controller
         x, y, z = scene.condyle_centre
         return replace(scene, condyle_centre=(x, y - (opening - self._start), z))
