@@ -19,7 +19,7 @@ from rclpy.qos import QoSProfile
 
 from knee_gap_msgs.msg import GapEstimate
 
-DOMAIN = 71
+DOMAIN = 143
 PAGE = Path(__file__).parents[2] / "docs" / "controller.md"
 GAP_QOS = QoSProfile(depth=64, deadline=Duration(nanoseconds=100_000_000))
 
