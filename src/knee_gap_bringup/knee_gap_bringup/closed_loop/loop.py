@@ -102,7 +102,7 @@ class ClosedLoop:
         excess = EXCESS if settings.fault is Fault.NOISE else 1.0
         self.knee = OpeningKnee(settings.level, settings.seed, opening, ViewErrors(excess=excess))
         self.leg = SimulatedLeg(opening, settings.mechanics)
-        self.control = LegControl(settings.leg)
+        self.control = LegControl(settings.leg, _BEGIN)
         self.faults = FaultSchedule(settings.fault, settings.seed, settings.duration)
         self.command = hold("no estimate received yet")
         self.passed_on: int | None = None
