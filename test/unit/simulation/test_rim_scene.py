@@ -3,6 +3,7 @@
 import re
 
 import cv2
+import mcap_doctor
 import numpy as np
 import pytest
 
@@ -143,6 +144,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     other = Recording(duration_s=0.1, seed=14)
     make_bag(tmp_path / "c" / "bag", other, progress=False)
     a, b, c = ((tmp_path / name / "bag" / "bag_0.mcap").read_bytes() for name in "abc")
+    assert mcap_doctor.examine(tmp_path / "a" / "bag" / "bag_0.mcap")
     assert a == b
     assert a != c
 

@@ -133,6 +133,7 @@ def _batches(steps: Iterable[_Step]) -> Iterator[list[_Step]]:
 
 
 def _steps(reader: BagReader, pipeline: GapPipeline) -> Iterator[_Step]:
+    packer = _Packer(pipeline)
     # The file's place is shared with the process that forked; read it through a handle of our own.
     with BagReader(reader.path) as own:
         for topic, message, stamp_ns in _decoded_ahead(fed(own, pipeline.inputs), pipeline.inputs[-1]):
@@ -140,17 +141,31 @@ def _steps(reader: BagReader, pipeline: GapPipeline) -> Iterator[_Step]:
                 yield _Step(stamp_ns, [])
                 continue
             observed = pipeline.observe(topic, message, stamp_ns)
-            yield _Step(stamp_ns, [_packed(item, pipeline) for item in observed])
-    yield _Step(None, [_packed(item, pipeline) for item in pipeline.observe_end()])
+            yield _Step(stamp_ns, [packer.packed(item) for item in observed])
+    yield _Step(None, [packer.packed(item) for item in pipeline.observe_end()])
 
 
-def _packed(item: Output | Request, pipeline: GapPipeline) -> tuple[Any, ...]:
-    if isinstance(item, Output):
-        msgtype, _ = pipeline.outputs[item.topic]
-        return (item.topic, serialized(item.message, msgtype), item.stamp_ns)
-    msgtype, _ = pipeline.estimation.handlers[item.kind]
-    data = serialized(item.message, msgtype) if msgtype else b""
-    return (item.kind, item.what, data, item.now_ns)
+class _Packer:
+    """Serialises results and requests; a message that is both is serialised once."""
+
+    def __init__(self, pipeline: GapPipeline) -> None:
+        self._pipeline = pipeline
+        self._last: Any = None
+        self._data = b""
+
+    def packed(self, item: Output | Request) -> tuple[Any, ...]:
+        """Return what `_second_stage` takes."""
+        if isinstance(item, Output):
+            data = self._serialized(item.message, self._pipeline.outputs[item.topic][0])
+            return (item.topic, data, item.stamp_ns)
+        msgtype, _ = self._pipeline.estimation.handlers[item.kind]
+        data = self._serialized(item.message, msgtype) if msgtype else b""
+        return (item.kind, item.what, data, item.now_ns)
+
+    def _serialized(self, message: Any, msgtype: str) -> bytes:
+        if message is not self._last:
+            self._last, self._data = message, serialized(message, msgtype)
+        return self._data
 
 
 def _decoded_ahead(messages: Iterable[Fed], image_topic: str) -> Iterator[Fed]:
