@@ -212,7 +212,7 @@ def test_a_bag_without_metadata_is_read_as_by_check_and_process(
 ) -> None:
     folder = tmp_path / "bare"
     folder.mkdir()
-    shutil.copy(step_bags[0] / "board_0.mcap", folder / "board.mcap")
+    shutil.copy(step_bags[0] / "board_0.mcap", folder / "board_0.mcap")
     hashes = []
     for number, place in enumerate((step_bags[0], folder, folder / "board_0.mcap")):
         out = tmp_path / f"{number}.yaml"
