@@ -50,7 +50,8 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
                 command += ["-p", "use_sim_time:=true"]
             command += scope_arguments(node, bag)
             if node == "segmentation_node":
-                command += ["-p", "image_transport:=compressed"]
+                # Of a recording every image is wanted, however late it is answered.
+                command += ["-p", "image_transport:=compressed", "-p", "max_image_lag:=0.0"]
                 if rate < 1.0:
                     # Played slowly so that nothing is lost: no pose is to arrive too late either.
                     command += ["-p", f"max_pose_wait:={LONGEST_POSE_WAIT}"]

@@ -186,14 +186,15 @@ class SegmentationNode(BaseNode):
         busy machine they would fall behind and be too old for every image; and the newest image would wait
         behind all the others.
         """
-        with self._images.handle:
-            while (taken := self._images.handle.take_message(self._kind, False)) is not None:
-                self.take_image(*taken)
         with self._poses.handle:
             while (taken := self._poses.handle.take_message(PoseWithCovarianceStamped, False)) is not None:
                 self._stream.on_lens_pose(taken[0])
-        if self._longest_lag_ns:
-            self._dropped += self._stream.drop_old(self._longest_lag_ns, self.now_ns())
+        if not self._longest_lag_ns:
+            return  # the middleware's queue bounds how many images wait
+        with self._images.handle:
+            while (taken := self._images.handle.take_message(self._kind, False)) is not None:
+                self.take_image(*taken)
+        self._dropped += self._stream.drop_old(self._longest_lag_ns, self.now_ns())
 
     def now_ns(self) -> int:
         """Clock for waiting times; with use_sim_time the bag's, so that a slow replay waits longer."""

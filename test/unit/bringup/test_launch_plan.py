@@ -74,7 +74,7 @@ def test_what_stands_beside_a_bag_is_of_the_tracked_body_alone(bag):
     beside.touch()
     segmentation, tracking, uncertainty, _ = replay_plan(str(bag), "")
     assert tracking.parameters == (str(beside),)
-    assert segmentation.parameters == ({"image_transport": "compressed"},)
+    assert segmentation.parameters == ({"image_transport": "compressed", "max_image_lag": 0.0},)
     assert uncertainty.parameters == ()
     plan = replay_plan(str(bag), "", params="mine.yaml")
     assert all("mine.yaml" in process.parameters for process in plan if process.role is Role.NODE)
@@ -96,7 +96,10 @@ def test_a_calibration_beside_a_bag_is_for_both_nodes_that_use_one(bag):
 def test_a_node_s_command_line_carries_namespace_and_parameters(namespace):
     segmentation, *_ = replay_plan("bag", "", params="mine.yaml", namespace=namespace)
     given = " ".join(segmentation.ros_arguments)
-    assert given == ("--ros-args -r __ns:=/knee_gap --params-file mine.yaml -p image_transport:=compressed")
+    assert given == (
+        "--ros-args -r __ns:=/knee_gap --params-file mine.yaml -p image_transport:=compressed "
+        "-p max_image_lag:=0.0"
+    )
     assert PLAYER.ros_arguments == ()
 
 

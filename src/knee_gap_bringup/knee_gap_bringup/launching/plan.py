@@ -112,7 +112,8 @@ def replay_plan(
     own: dict[str, tuple[str | Mapping[str, object], ...]] = {
         name: given or _beside(Path(bag), name) for name in NODES
     }
-    own["segmentation_node"] += ({"image_transport": "compressed"},)
+    # Of a recording every image is wanted, however late it is answered.
+    own["segmentation_node"] += ({"image_transport": "compressed", "max_image_lag": 0.0},)
     plan = [
         PlannedProcess(package, name, namespace=namespace, parameters=own[name])
         for name, package in NODES.items()
