@@ -59,8 +59,8 @@ def small(instrument: float, fault: Fault = Fault.NONE, duration: float = 5.0) -
 
 @pytest.fixture(scope="module")
 def thin() -> Outcome:
-    """A loop whose instrument fits before the joint is opened."""
-    return run_loop(small(0.0015))
+    """A loop whose instrument is thinner than the joint is open from the start."""
+    return run_loop(small(0.0008))
 
 
 def test_an_instrument_that_fits_is_passed(thin: Outcome) -> None:
@@ -69,31 +69,36 @@ def test_an_instrument_that_fits_is_passed(thin: Outcome) -> None:
     assert not thin.beyond_limit
     valid = [one for one in thin.heard if one.is_valid]
     # The instrument's own lower bound decided, and the truth lies within the bounds.
-    assert valid[-1].gap_min >= 0.0015
+    assert valid[-1].gap_min >= 0.0008
     assert all(one.gap_min <= thin.true_gap <= one.gap_max for one in valid)
-    assert (thin.trace[:, 2] == 0.0).all()
+
+
+def opening(settings: LoopSettings) -> tuple[ClosedLoop, int]:
+    """A loop, advanced until the leg begins to open, and the tick at which it does."""
+    closed = ClosedLoop(settings)
+    for tick in range(round(5.0 / TICK)):
+        closed.advance(tick)
+        if closed.command.action is Action.OPEN:
+            return closed, tick
+    raise AssertionError(closed.command)
 
 
 def test_the_leg_opens_by_steps_and_is_measured_again() -> None:
-    closed = ClosedLoop(small(0.004))
-    start, tracks, moved = closed.leg.opening, set(), False
-    for tick in range(round(2.6 / TICK)):
+    closed, begin = opening(small(0.004))
+    assert closed._last is not None
+    start, track = closed.leg.opening, closed._last[0].track_id
+    for tick in range(begin + 1, begin + round(1.5 / TICK)):
         closed.advance(tick)
-        if closed.command.action is Action.OPEN:
-            moved = True
-        if closed._last is not None:
-            tracks.add(closed._last[0].track_id)
-    assert moved
     assert closed.leg.opening > start
     assert closed.passed_on is None
-    assert {1, 2} <= tracks
+    assert closed._last[0].track_id > track
 
 
 def test_the_joint_is_not_opened_where_it_may_be_at_its_limit() -> None:
     leg = LegParameters(instrument_diameter=0.004, largest_gap=0.0045)
     closed = ClosedLoop(replace(small(0.004), leg=leg))
     upper, begun = [], 0
-    for tick in range(round(2.6 / TICK)):
+    for tick in range(round(3.2 / TICK)):
         before = closed.command.action
         closed.advance(tick)
         if closed.heard and closed.heard[-1].is_valid:
@@ -109,16 +114,13 @@ def test_the_joint_is_not_opened_where_it_may_be_at_its_limit() -> None:
 
 @pytest.mark.parametrize("fault", [Fault.STALE, Fault.SILENT])
 def test_the_leg_is_held_while_nothing_is_heard(fault: Fault) -> None:
-    closed = ClosedLoop(small(0.004, fault))
-    # From shortly after the leg began to open.
-    closed.faults.spans = np.array([[1.5, 2.6]])
-    rates = {}
-    for tick in range(round(2.6 / TICK)):
+    closed, begin = opening(small(0.004, fault))
+    closed.faults.spans = np.array([[0.0, 100.0]])
+    late = begin + round((closed.settings.leg.deadline + 0.04) / TICK)
+    for tick in range(begin + 1, late + round(0.5 / TICK)):
         closed.advance(tick)
-        rates[tick] = closed.command.opening_rate
-    assert rates[round(1.48 / TICK)] > 0.0
-    deadline = closed.settings.leg.deadline
-    assert all(rate == 0.0 for tick, rate in rates.items() if tick * TICK > 1.5 + deadline + 2 * TICK)
+        assert closed.command.opening_rate == 0.0 or tick <= late
+    assert closed.command.action is Action.HOLD
 
 
 def test_a_wrong_pass_is_found(
@@ -149,9 +151,9 @@ def test_the_table_counts_what_must_not_be(thin: Outcome) -> None:
     ]
     heads, none, lost, total = command.table(outcomes)
     assert none.split()[:3] == ["none", "4", "3"]
-    assert none.split()[4:8] == ["11.00", "2", "1", "0"]
+    assert none.split()[4:8] == ["11.70", "2", "1", "0"]
     assert lost.split()[:3] == ["lost", "1", "1"]
-    assert total.split()[4:8] == ["11.00", "2", "1", "2"]
+    assert total.split()[4:8] == ["11.70", "2", "1", "2"]
     assert len({len(line) for line in (heads, none, lost, total)}) == 1
 
 
@@ -168,7 +170,7 @@ def test_runs_take_the_faults_in_turn(
 
     monkeypatch.setattr(command, "run_loop", run)
     arguments = ["--seed", "10", "--runs", "4", "--out", str(tmp_path / "plot.png"), "--fault"]
-    assert command.main([*arguments, "lost", "stale"]) == 1  # 4 mm do not fit: `thin` was of 1.5 mm
+    assert command.main([*arguments, "lost", "stale"]) == 1  # 4 mm do not fit: `thin` was of 0.8 mm
     assert asked == [(10, Fault.LOST), (11, Fault.STALE), (12, Fault.LOST), (13, Fault.STALE)]
     assert "1 knees were left out" in capsys.readouterr().out
     asked.clear()
