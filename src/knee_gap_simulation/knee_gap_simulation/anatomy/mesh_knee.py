@@ -36,8 +36,9 @@ KIND = "meshes"
 BEHIND = 0.0035
 _NEAR = 0.3e-3  # spacing [m] of the samples for clearances
 _WALL_SPACING = 0.15e-3
-# The wall: half width and height around the gap, how far in front, and behind the tissue below [m].
-_ASIDE, _HEIGHT, _BEFORE, _AFTER = 0.0115, 0.022, 0.040, 0.003
+# The wall: half width and height around the gap, how far in front, and behind the tissue below [m]: the
+# instrument of the true gap reaches 10 mm behind its section and must not meet it.
+_ASIDE, _HEIGHT, _BEFORE, _AFTER = 0.0115, 0.022, 0.040, 0.016
 
 
 class MeshKnee:

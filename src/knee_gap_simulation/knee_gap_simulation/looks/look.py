@@ -137,8 +137,9 @@ class Look:
             lens=lens,
             gap=float(rng.uniform(0.0022, 0.0065)),
             roll=float(rng.uniform(-1.1, 1.1)),
-            wall_behind=float(rng.uniform(0.006, 0.036)),
-            wall_aside=float(rng.uniform(0.0075, 0.0190)),
+            # Far enough that the instrument of the true gap, which reaches 10 mm behind it, never meets it.
+            wall_behind=float(rng.uniform(0.022, 0.040)),
+            wall_aside=float(rng.uniform(0.0105, 0.0190)),
             condyle_aside=float(rng.normal(0.0, 0.0055)),
             rim_bend=float(rng.uniform(-40.0, 110.0)),
             instrument=_INSTRUMENTS[str(rng.choice(list(_INSTRUMENTS)))],
