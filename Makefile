@@ -10,7 +10,7 @@ setup: ## set up whatever is missing
 	@tools/setup
 
 anatomy: setup ## add what knees of meshes need (make_bag --anatomy)
-	@tools/env uv pip install -q --require-hashes -r tools/requirements/anatomy.lock
+	@tools/env sh -c 'uv pip install -q --python "$$(command -v python)" --require-hashes -r tools/requirements/anatomy.lock'
 
 demo: setup ## play the sample bag through the live nodes; results in out/demo
 	@tools/run knee_gap_bringup demo
