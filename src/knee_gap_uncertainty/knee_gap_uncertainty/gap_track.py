@@ -68,7 +68,7 @@ class Track:
         camera_columns: int = 0,
         suspects_creep: bool = False,
     ) -> None:
-        self._calibration = self._stated = calibration
+        self._calibration = self._admitted = calibration
         # Whether no track has shown yet that the tracked body does not creep, or motion has ended one since.
         self.suspects_creep = suspects_creep
         self._camera_columns = camera_columns
@@ -169,12 +169,12 @@ class Track:
         return corrected, self._fitted(corrected)[0], passing
 
     def _admit_creep(self) -> None:
-        """While creep is suspected, admit the largest rate that the views leave possible."""
+        """While creep is suspected, let the bounds admit the largest rate that the views leave possible."""
         rate = (
             self._joint_motion.largest_rate / self._parameters.tracker_bound if self.suspects_creep else 0.0
         )
-        self.suspects_creep = rate > self._stated.drift
-        self._calibration = replace(self._stated, drift=max(rate, self._stated.drift))
+        self.suspects_creep = rate > self._calibration.drift
+        self._admitted = replace(self._calibration, drift=max(rate, self._calibration.drift))
 
     def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
@@ -258,7 +258,7 @@ class Track:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
         angle = max(first.angular_error, present.angular_error)
         position = max(first.translation_error, present.translation_error)
-        shared = self._calibration.bounds(first, present, self._parameters.tracker_bound)
+        shared = self._admitted.bounds(first, present, self._parameters.tracker_bound)
         return angle + shared[0], position + shared[1]
 
     def _measured(

@@ -76,12 +76,12 @@ def test_the_interval_is_wider_by_what_lasts_over_a_track_and_by_the_drift() -> 
     positions = list(np.linspace(0.0, 0.006, 120))
     widths = []
     for drift, share in ((0.0, 0.0), (0.002, 0.0), (0.002, 1.0)):
-        parameters = EstimatorParameters(**EXACT_SCOPE, scale_drift=drift, correlated_error_share=share)
+        parameters = replace(EXACT, tracker_scale=0.0, scale_drift=drift, correlated_error_share=share)
         last = run(GapEstimator(parameters), positions)[-1]
         assert last.status is GapStatus.VALID
         widths.append(last.point_distance_confidence_max - last.point_distance_confidence_min)
     assert widths[0] < 0.99 * widths[1] < 0.98 * widths[2]
-    default = run(GapEstimator(EXACT), positions)[-1]
+    default = run(GapEstimator(replace(EXACT, tracker_scale=0.0)), positions)[-1]
     assert default.point_distance_confidence_max - default.point_distance_confidence_min == pytest.approx(
         widths[2]
     )
