@@ -15,6 +15,7 @@ SHARP = 3  # [px at working size] over which a sharp edge rises
 LEAST_RANGE = 4.0  # [grey levels]: less is noise
 FACING = 0.5  # [-] cosine to the section from which a piece of the border belongs to one of its sides
 BEYOND = 6  # [px at working size] from the border, within which no instrument or glare may be
+REACH = 12  # [px at working size] of the smoothing of a mask
 INSIDE = 2.0  # [px at working size] inside the field, where a line must end
 
 
@@ -47,17 +48,21 @@ def border_sharpness(
 
 def _border(part: Mask) -> tuple[Array, Array]:
     """Pixels (n, 2) of the border of a part (h, w), and the unit vectors (n, 2) out of it there."""
-    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    # Only the part's own box is looked at, with the reach of the smoothing.
+    x, y, width, height = cv2.boundingRect(part.astype(np.uint8))
+    x0, y0 = max(x - REACH, 0), max(y - REACH, 0)
+    box = part[y0 : y + height + REACH, x0 : x + width + REACH]
+    contours, _ = cv2.findContours(box.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     border = np.concatenate([contour[:, 0] for contour in contours])
     # The border of a mask is a staircase: the direction is that of the smoothed mask.
-    soft = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 2.0)
+    soft = cv2.GaussianBlur(box.astype(np.float32), (0, 0), 2.0)
     column, row = border.T
     outward = -np.stack(
         [cv2.Sobel(soft, cv2.CV_32F, 1, 0)[row, column], cv2.Sobel(soft, cv2.CV_32F, 0, 1)[row, column]],
         axis=1,
     ).astype(np.float64)
     length = np.linalg.norm(outward, axis=1, keepdims=True)
-    return border.astype(np.float64), outward / np.maximum(length, 1e-6)
+    return border + np.array([x0, y0], np.float64), outward / np.maximum(length, 1e-6)
 
 
 def _sharpness(smooth: npt.NDArray[np.float32], border: Array, outward: Array) -> float:
