@@ -1,5 +1,6 @@
 """Gap detector for one image: segmentation, section, and the decision whether it is a gap."""
 
+from math import ceil, floor
 from typing import NamedTuple
 
 import cv2
@@ -13,12 +14,14 @@ from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
 from knee_gap_perception.gap_detection.cross_section import Section, find_section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
-from knee_gap_perception.image.instruments_and_glare import foreign_bodies
+from knee_gap_perception.image.instruments_and_glare import USUAL_LIMIT, foreign_bodies, least_warmth
+from knee_gap_perception.image.shafts import ShaftFinder
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the image is too dark
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
 OVEREXPOSED_SHARE = 0.7  # of the field
+REFRESH_EVERY = 30  # images of a track between measurements of the tissue's warmth: white balance drifts
 
 
 class NoPointsError(Exception):
@@ -49,6 +52,9 @@ class GapSearch:
         self.confidence = float("nan")
         self._segmentation = segmentation_named(parameters.segmentation, **_settings(parameters))
         self._evidence = ConfidenceFilter()
+        self._shafts = ShaftFinder()
+        self._warmth = USUAL_LIMIT
+        self._warmth_age = 0
 
     def forget(self) -> None:
         """Forget all images."""
@@ -58,7 +64,8 @@ class GapSearch:
         """Mask (h, w) of the gap in an image (h, w, 3): 255 in the gap, 0 elsewhere."""
         small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
-        dark = self._segmentation(small, inside & ~foreign_bodies(small))
+        foreign, _ = self._foreign(picture, small, brightness(small), field, scale)
+        dark = self._segmentation(small, inside & ~foreign)
         size = (picture.shape[1], picture.shape[0])
         full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
@@ -71,12 +78,16 @@ class GapSearch:
         """
         height, width = picture.shape[:2]
         scale = min(1.0, self.parameters.working_rows / min(height, width))
-        first = np.clip(np.floor(around.min(axis=0) - margin), 0, [width - 2, height - 2]).astype(int)
-        last = np.clip(np.ceil(around.max(axis=0) + margin), first + 2, [width, height]).astype(int)
-        part = picture[first[1] : last[1], first[0] : last[0]]
-        size = tuple(max(1, round(float(side) * scale)) for side in last - first)
-        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return foreign_bodies(small), scale, first.astype(np.float64)
+        left, top = around.min(axis=0).tolist()
+        right, bottom = around.max(axis=0).tolist()
+        x0, x1 = _within(left - margin, right + margin, width)
+        y0, y1 = _within(top - margin, bottom + margin, height)
+        size = max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale))
+        part = np.asarray(cv2.resize(picture[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA), np.uint8)
+        if self._warmth_age % REFRESH_EVERY == 0:
+            self._warmth = least_warmth(picture)
+        self._warmth_age += 1
+        return foreign_bodies(part, self._warmth), scale, np.array([x0, y0], np.float64)
 
     def agreed_section(
         self, stamp_ns: int, picture: Image, camera: Camera, field: FieldOfView, clicked: Array | None
@@ -109,9 +120,9 @@ class GapSearch:
         )
         value = brightness(small)
         light = check_light(value[inside])
-        foreign = foreign_bodies(small)
+        foreign, shafts = self._foreign(picture, small, value, field, scale)
         dark = self._segmentation(small, inside & ~foreign)
-        section = find_section(dark, value, foreign, field, scale, self._region(field, clicked))
+        section = find_section(dark, value, foreign, field, scale, self._region(field, clicked), shafts)
         if section is None:
             raise NoPointsError(
                 EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
@@ -132,6 +143,17 @@ class GapSearch:
             )
         return Found(section, foreign, scale)
 
+    def _foreign(
+        self, picture: Image, small: Image, value: Image, field: FieldOfView, scale: float
+    ) -> tuple[Mask, Mask]:
+        """Instruments and glare, and the shafts among them, at working size (h, w).
+
+        `small` (h, w, 3) is the image reduced by `scale`, `value` (h, w) its brightness.
+        """
+        warmth = least_warmth(picture)
+        shafts = self._shafts.find(small, value, field, scale, warmth)
+        return foreign_bodies(small, warmth) | shafts, shafts
+
     def _smaller(self, picture: Image) -> tuple[Image, float]:
         """An image (h, w, 3) at working size, and its scale relative to the full image."""
         scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
@@ -145,6 +167,12 @@ class GapSearch:
             return clicked, min(radius, 0.2 * field.extent)
         centre = np.array(self.parameters.region_centre)
         return np.where(np.isnan(centre), np.array(field.centre), centre), radius
+
+
+def _within(first: float, last: float, size: int) -> tuple[int, int]:
+    """First pixel and the one behind the last of an interval, inside an image of a size; at least two."""
+    begin = min(max(floor(first), 0), size - 2)
+    return begin, min(max(ceil(last), begin + 2), size)
 
 
 def check_light(values: Image) -> float:
