@@ -13,10 +13,10 @@ from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.models import Camera, bearing_jacobian
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
-from knee_gap_perception.gap_detection.gap_detector import GapSearch, NoPointsError, check_light
+from knee_gap_perception.gap_detection.gap_detector import Found, GapSearch, NoPointsError, check_light
 from knee_gap_perception.gap_detection.section_edges import SectionEdgeFinder
 from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, why_no_field
-from knee_gap_perception.point_tracking.point_selection import choose_points
+from knee_gap_perception.point_tracking.point_selection import SurfacePoint, choose_points
 from knee_gap_perception.point_tracking.point_tracker import PointObservation, PointTracker
 from knee_gap_perception.point_tracking.tangent_plane import View
 
@@ -115,7 +115,10 @@ class GapEdgeTracker:
         if field.depth_inside(clicked) <= 0:
             return "the point lies outside the field of view"
         try:
-            self._search.section(self._image, camera, field, clicked)
+            found = self._search.section(self._image, camera, field, clicked)
+            self._chosen_points(
+                np.asarray(cv2.extractChannel(self._image, 1), np.uint8), camera, field, found
+            )
         except (NoPointsError, PerceptionError) as refusal:
             return str(refusal)
         self.choose_at(clicked)
@@ -267,13 +270,9 @@ class GapEdgeTracker:
         field: FieldOfView,
     ) -> list[PointObservation]:
         """Find the gap, choose the points and begin a track."""
-        section, foreign, scale = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
-        inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
-        points = choose_points(grey, section, field, inset_px, foreign, scale)
-        if points is None:
-            raise NoPointsError(
-                EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
-            )
+        found = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
+        section = found.section
+        points = self._chosen_points(grey, camera, field, found)
         first, second = (
             PointTracker(grey, point.pixel, point.dark_below, camera, view, point.kind) for point in points
         )
@@ -289,6 +288,18 @@ class GapEdgeTracker:
         self._next_track_id += 1
         self._clicked = None
         return [first.first, second.first]
+
+    def _chosen_points(
+        self, grey: Image, camera: Camera, field: FieldOfView, found: Found
+    ) -> list[SurfacePoint]:
+        """The two points beside a section that was found; raises NoPointsError where a side has none."""
+        inset_px = self.parameters.inset / camera.radians_per_pixel(found.section.centre)
+        points = choose_points(grey, found.section, field, inset_px, found.foreign, found.scale)
+        if points is None:
+            raise NoPointsError(
+                EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
+            )
+        return points
 
     def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
         """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.
