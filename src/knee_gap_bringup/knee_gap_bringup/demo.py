@@ -14,8 +14,8 @@ from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_replay.report.comparison import EDGES, GAP, compare
-from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, PARAMETERS_FILE
 
 NAMESPACE = "/knee_gap"
@@ -119,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except StartError as error:
         print(f"demo: {error}", file=sys.stderr)
         return error.code
-    except (BagError, SimulationError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

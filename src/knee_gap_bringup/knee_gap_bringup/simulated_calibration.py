@@ -16,14 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.bag.bag import BagReader
-from knee_gap_core.bag.errors import BagError
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_perception.calibration.calibration import Calibration, Clock, LensOnBody
 from knee_gap_perception.calibration.calibration_file import save_calibration
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.camera.medium import medium_of
-from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_rotation.shaft_axis import Mount
-from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_simulation.scope.media import calibrated
 
@@ -88,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with BagReader(asked.bag) as reader:
             truth = scene_from_metadata(reader.metadata)
         save_calibration(simulated_calibration(truth, asked.seed), asked.bag / CALIBRATION_FILE)
-    except (BagError, SimulationError, PerceptionError) as error:
+    except KneeGapError as error:
         print(f"simulated_calibration: {error}", file=sys.stderr)
         return 1
     print(f"simulated_calibration: {asked.bag / CALIBRATION_FILE} written")

@@ -15,6 +15,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
+from knee_gap_core.values.errors import KneeGapError
+
 # Parameters, calibrations and a bag's metadata are thousands of bytes; some seconds of reading at most.
 MOST_YAML_BYTES = 1 << 19
 MOST_YAML_DEPTH = 32
@@ -31,7 +33,7 @@ _KINDS = (
 )
 
 
-class FileError(ValueError):
+class FileError(KneeGapError):
     """A file that cannot be used; the message is one line and names the file and the reason."""
 
 

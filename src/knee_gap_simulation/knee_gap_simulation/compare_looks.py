@@ -8,8 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from knee_gap_core.node.arguments import Parser
-from knee_gap_core.user_files import FileError
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_simulation.contact_sheet import moment, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import LEVELS
@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         real = pictures(arguments.pictures) if arguments.pictures else None
         seeds = range(arguments.first_seed, arguments.first_seed + arguments.count)
         print(compared(seeds, real))
-    except (SimulationError, FileError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"compare_looks: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -9,7 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from knee_gap_core.node.arguments import Parser
-from knee_gap_core.user_files import FileError, open_file
+from knee_gap_core.user_files import open_file
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import LEVELS
 from knee_gap_simulation.knee_simulator import KneeSimulator
@@ -124,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         real = [frame for path in arguments.beside for frame in read_frames(path)]
         sheet = contact_sheet(arguments.seeds, real, arguments.appearance)
-    except (SimulationError, FileError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"contact_sheet: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

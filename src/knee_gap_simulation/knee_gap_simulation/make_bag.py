@@ -13,8 +13,9 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.user_files import FileError, flaw_of_new
+from knee_gap_core.user_files import flaw_of_new
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.bag_arguments import bag_parser
 from knee_gap_simulation.calibration.bag import (
@@ -375,7 +376,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             make_knee_bag(arguments.out, _knee(arguments))
         else:
             make_bag(arguments.out, _rims(arguments))
-    except (SimulationError, BagError, FileError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"make_bag: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

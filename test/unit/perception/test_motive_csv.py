@@ -46,7 +46,17 @@ class TestVarieties:
             Export(delimiter="\t"),
             Export(newline="\n"),
         ],
-        ids=str,
+        ids=[
+            "1.21 without labels",
+            "1.22",
+            "1.23",
+            "1.24 with timecode",
+            "1.25 with parents and timecode",
+            "1.25 with parents",
+            "semicolons",
+            "tabs",
+            "line feeds",
+        ],
     )
     @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
     def test_every_form_of_the_file_gives_the_same(self, tmp_path, export, encoding):

@@ -12,6 +12,7 @@ from typing import Self
 from ament_index_python.packages import get_package_prefix
 
 from knee_gap_bringup.launching.plan import exit_code_of
+from knee_gap_core.values.errors import KneeGapError
 
 # Logged by every node once it can receive messages.
 READY = "ready"
@@ -19,7 +20,7 @@ READY = "ready"
 GRACE = 10.0
 
 
-class StartError(RuntimeError):
+class StartError(KneeGapError):
     """A process did not start, or ended too early; the message names it and quotes its last line.
 
     `code` is the exit code of the command: that of the process, or 1 if it has none or ended with 0.

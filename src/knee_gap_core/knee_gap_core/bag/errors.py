@@ -1,7 +1,9 @@
 """What goes wrong with bags."""
 
+from knee_gap_core.values.errors import KneeGapError
 
-class BagError(ValueError):
+
+class BagError(KneeGapError):
     """A bag, topic, type or command that cannot be used; the message is one line and says why."""
 
 

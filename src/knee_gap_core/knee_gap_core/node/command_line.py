@@ -11,13 +11,11 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser as Parser
 from knee_gap_core.node.arguments import finite as finite
 from knee_gap_core.node.arguments import not_negative as not_negative
 from knee_gap_core.node.arguments import positive as positive
-from knee_gap_core.node.errors import ConfigurationError
-from knee_gap_core.user_files import FileError
+from knee_gap_core.values.errors import KneeGapError
 
 Item = TypeVar("Item")
 _SECONDS_BETWEEN_LINES = 10.0
@@ -33,7 +31,7 @@ def run(
     logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
     try:
         return command(arguments)
-    except (BagError, ConfigurationError, FileError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

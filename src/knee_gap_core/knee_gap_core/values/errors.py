@@ -1,7 +1,14 @@
-"""Why a measurement is refused: one small family, each message with the rule and the value that broke it."""
+"""The base of all errors of the suite, and why a measurement is refused.
+
+Each message is one line with the rule and the value that broke it.
+"""
 
 
-class MeasurementError(ValueError):
+class KneeGapError(ValueError):
+    """What the suite raises on purpose: an input, a setting or a file that cannot be used."""
+
+
+class MeasurementError(KneeGapError):
     """No honest number can be given for these views."""
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_perception.calibrate.measurements.boards import BOARD_SYNTAX, board_from_text
 from knee_gap_perception.calibrate.procedure import Procedure
 from knee_gap_perception.calibrate.recording import Recording, Request
@@ -87,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _show_parameters(calibration) if arguments.parameters else _show(calibration)
         else:
             _calibrate(arguments)
-    except (PerceptionError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"calibrate {arguments.step}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from knee_gap_core.node.arguments import Parser
-from knee_gap_perception.errors import PerceptionError
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_perception.marks.marking_server import MarkingServer
 from knee_gap_perception.marks.marking_session import MarkingSession
 from knee_gap_perception.marks.marks_file import read_marks
@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.check:
             return _check(marks, arguments.folder)
         return _serve(MarkingSession(arguments.folder, marks, arguments.frames), arguments.port)
-    except (PerceptionError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"mark: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

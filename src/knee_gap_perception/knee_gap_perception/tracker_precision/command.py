@@ -12,6 +12,7 @@ import numpy as np
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser, finite
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_perception.calibrate.bag_input import opened
 from knee_gap_perception.errors import PerceptionError
@@ -169,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="tracker_precision: %(message)s", stream=sys.stderr)
     try:
         _run(arguments)
-    except (PerceptionError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"tracker_precision: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

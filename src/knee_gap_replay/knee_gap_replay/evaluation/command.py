@@ -15,6 +15,7 @@ from tqdm import tqdm
 from knee_gap_core.bag.bag_paths import missing_bag
 from knee_gap_core.node.arguments import Parser
 from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_perception.calibrate.bag_input import CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_perception.camera.models import Camera, EquiangularCamera, camera_from_info
@@ -220,7 +221,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.out.mkdir(parents=True, exist_ok=True)
         rows = evaluate(_progress(pairs, count), camera, arguments.out)
         write_csv(rows, arguments.out)
-    except (PerceptionError, OSError) as error:
+    except (KneeGapError, OSError) as error:
         print(f"evaluate: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -18,13 +18,13 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.command_line import Parser, run
 from knee_gap_core.user_files import shown
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_replay.report.comparison import Truths
 from knee_gap_replay.report.frames import choose_stamps, draw_frames
 from knee_gap_replay.report.page import INDEX_COLUMNS, Content, bag_page, index_page, index_row
 from knee_gap_replay.report.results import Floats, Results, read_results
 from knee_gap_replay.report.table import require_parquet, write_csv, write_parquet
 from knee_gap_replay.topics import add_topic_arguments, namespace_from, topics_from
-from knee_gap_simulation.errors import SimulationError
 
 INDEX = "index.html"
 TABLE = "bags.csv"
@@ -53,7 +53,7 @@ def _truth(results: Results, recording: Path, edges_topic: str, most: int) -> tu
     truth = np.full(len(results.status), np.nan)
     try:
         truths = Truths(recording, results.path, edges_topic)
-    except (BagError, SimulationError) as error:
+    except KneeGapError as error:
         return truth, f"not known: {error}"
     # Evenly over the estimates of images: an image costs a fraction of a second.
     of_images = np.flatnonzero(np.isfinite(results.time) & (results.track_ids > 0))

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.user_files import FileError, json_value, read_bytes, reason_of
+from knee_gap_core.values.errors import KneeGapError
 from knee_gap_replay.whole_bags.one_bag import Job, process_one
 from knee_gap_replay.whole_bags.overlapped import usable_cores
 
@@ -130,7 +130,7 @@ def _outcome(job: Job) -> tuple[str, str, dict[str, int], int, int]:
     with contextlib.redirect_stderr(io.StringIO()):
         try:
             result = process_one(job, workers=1)
-        except (BagError, ConfigurationError, FileError, OSError) as error:
+        except (KneeGapError, OSError) as error:
             return ("failed", str(error), {}, 0, 0)
     remark = result.lines[-1] if result.exit_code else "; ".join(result.lines[:-1])
     valid = sum(count for topic, count in result.counts.items() if topic.endswith("/gap/snr"))
