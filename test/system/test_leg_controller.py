@@ -42,7 +42,10 @@ class Leg:
         while not self.asked and time.monotonic() < began + 5.0:
             self.publish(0.0045, 0.005)
             client.spin(PERIOD)
-        # A new track begins beside the last estimates of the former.
+        # A new track begins beside the last estimates of the former, which must have been received before.
+        for _ in range(3):
+            self.publish(0.0045, 0.005, track_id=self.asked)
+            client.spin(PERIOD)
         self.publish(0.003, 0.004, status=GapEstimate.STATUS_INSUFFICIENT_PARALLAX)
         self.asked_at_start = self.asked
 

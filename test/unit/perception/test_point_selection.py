@@ -56,3 +56,13 @@ def test_where_every_place_is_beside_an_instrument_there_is_no_point():
     probe = NOTHING.copy()
     probe[60:75, 140:181] = True
     assert _chosen(probe) is None
+
+
+def test_a_point_may_be_nearer_to_glare_than_to_an_instrument():
+    spot = NOTHING.copy()
+    spot[66:72, 157:164] = True
+    upper, _ = choose_points(_gap(), SECTION, FIELD, INSET_PX, spot, SCALE, instruments=NOTHING)
+    # Within the margin of an instrument, and not on the spot itself.
+    assert abs(SCALE * upper.pixel[0] - 160.0) < 4 + AWAY
+    column, row = np.rint(SCALE * upper.pixel).astype(int)
+    assert not spot[row, column]

@@ -294,7 +294,9 @@ class GapEdgeTracker:
     ) -> list[SurfacePoint]:
         """The two points beside a section that was found; raises NoPointsError where a side has none."""
         inset_px = self.parameters.inset / camera.radians_per_pixel(found.section.centre)
-        points = choose_points(grey, found.section, field, inset_px, found.foreign, found.scale)
+        points = choose_points(
+            grey, found.section, field, inset_px, found.foreign, found.scale, found.instruments
+        )
         if points is None:
             raise NoPointsError(
                 EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"

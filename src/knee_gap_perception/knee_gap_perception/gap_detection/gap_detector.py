@@ -14,7 +14,12 @@ from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
 from knee_gap_perception.gap_detection.cross_section import Section, find_section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
-from knee_gap_perception.image.instruments_and_glare import USUAL_LIMIT, foreign_bodies, least_warmth
+from knee_gap_perception.image.instruments_and_glare import (
+    USUAL_LIMIT,
+    foreign_bodies,
+    least_warmth,
+    metal_and_glare,
+)
 from knee_gap_perception.image.shafts import ShaftFinder
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 
@@ -33,10 +38,14 @@ class NoPointsError(Exception):
 
 
 class Found(NamedTuple):
-    """A section, and instruments and glare, `foreign` (h, w), in the image reduced by `scale`."""
+    """A section, and what is no tissue in the image reduced by `scale`.
+
+    `foreign` (h, w) are instruments and glare, `instruments` (h, w) those alone.
+    """
 
     section: Section
     foreign: Mask
+    instruments: Mask
     scale: float
 
 
@@ -64,7 +73,7 @@ class GapSearch:
         """Mask (h, w) of the gap in an image (h, w, 3): 255 in the gap, 0 elsewhere."""
         small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
-        foreign, _ = self._foreign(picture, small, brightness(small), field, scale)
+        foreign, *_ = self._foreign(picture, small, brightness(small), field, scale)
         dark = self._segmentation(small, inside & ~foreign)
         size = (picture.shape[1], picture.shape[0])
         full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
@@ -120,7 +129,7 @@ class GapSearch:
         )
         value = brightness(small)
         light = check_light(value[inside])
-        foreign, shafts = self._foreign(picture, small, value, field, scale)
+        foreign, instruments, shafts = self._foreign(picture, small, value, field, scale)
         dark = self._segmentation(small, inside & ~foreign)
         section = find_section(dark, value, foreign, field, scale, self._region(field, clicked), shafts)
         if section is None:
@@ -141,18 +150,20 @@ class GapSearch:
                 f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
                 f"{self.parameters.minimum_confidence:.2f}",
             )
-        return Found(section, foreign, scale)
+        return Found(section, foreign, instruments, scale)
 
     def _foreign(
         self, picture: Image, small: Image, value: Image, field: FieldOfView, scale: float
-    ) -> tuple[Mask, Mask]:
-        """Instruments and glare, and the shafts among them, at working size (h, w).
+    ) -> tuple[Mask, Mask, Mask]:
+        """Instruments and glare, instruments alone, and the shafts among them, at working size (h, w).
 
         `small` (h, w, 3) is the image reduced by `scale`, `value` (h, w) its brightness.
         """
         warmth = least_warmth(picture)
         shafts = self._shafts.find(small, value, field, scale, warmth)
-        return foreign_bodies(small, warmth) | shafts, shafts
+        metal, glare = metal_and_glare(small, warmth)
+        instruments = metal | shafts
+        return instruments | glare, instruments, shafts
 
     def _smaller(self, picture: Image) -> tuple[Image, float]:
         """An image (h, w, 3) at working size, and its scale relative to the full image."""

@@ -46,17 +46,28 @@ def least_warmth(picture: Image) -> float:
 
 
 def foreign_bodies(image: Image, warmth: float) -> Mask:
-    """Pixels (h, w) of an image (h, w, 3) at working size that show metal or glare.
+    """Pixels (h, w) of an image (h, w, 3) at working size that show metal or glare; as `metal_and_glare`."""
+    metal, glare = metal_and_glare(image, warmth)
+    return metal | glare
+
+
+def metal_and_glare(image: Image, warmth: float) -> tuple[Mask, Mask]:
+    """Pixels (h, w) of an image (h, w, 3) at working size that show metal, and those that show glare.
 
     `warmth` is the least of tissue in the whole picture (`least_warmth`). In an image without colour (from a
     grey camera) no metal is detected.
     """
     blue, green, red = (np.asarray(channel, np.uint8) for channel in cv2.split(image))
     value = np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
-    found = np.zeros(value.shape, np.uint8)
-    _mark_glare(found, value, (blue, green, red))
-    if not np.array_equal(blue, red):
-        found |= _metal(value, blue, red, warmth)
+    glare = np.zeros(value.shape, np.uint8)
+    _mark_glare(glare, value, (blue, green, red))
+    has_colour = not np.array_equal(blue, red)
+    metal = _metal(value, blue, red, warmth) if has_colour else np.zeros(value.shape, np.uint8)
+    return _grown(metal), _grown(glare)
+
+
+def _grown(found: npt.NDArray[np.uint8]) -> Mask:
+    """Marked pixels (h, w) without the smallest regions, with the blurred border around the others."""
     if not found.any():
         return found > 0
     opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((SMALLEST, SMALLEST), np.uint8))

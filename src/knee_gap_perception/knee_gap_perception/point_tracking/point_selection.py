@@ -18,7 +18,8 @@ ALONG = (-48, -36, -24, -12, 0, 12, 24, 36, 48)  # [px] along the edge from the 
 INSETS = (0.75, 1.0, 1.25)  # of the inset that is asked for
 PATCH_HALF = 24  # [px] half side of the piece of tissue that is judged
 MINIMUM_TISSUE = 0.4  # share of that piece that must be tissue without highlight
-AWAY = 12  # [px at working size] from instruments and glare: half of what a point is followed by
+AWAY = 12  # [px at working size] from instruments: half of what a point is followed by
+AWAY_FROM_GLARE = 2  # [px at working size]: what is followed of a place leaves out its highlights
 MOST_OF_A_BLOCK = (
     1.5  # of the median block's texture that one block counts: drifting debris is texture as well
 )
@@ -50,15 +51,22 @@ class _Place(NamedTuple):
 
 
 def choose_points(
-    grey: Image, section: Section, field: FieldOfView, inset_px: float, foreign: Mask, scale: float
+    grey: Image,
+    section: Section,
+    field: FieldOfView,
+    inset_px: float,
+    foreign: Mask,
+    scale: float,
+    instruments: Mask | None = None,
 ) -> list[SurfacePoint] | None:
     """The two points beside a section's edges, `inset_px` inside the tissue; None where a side has none.
 
     Near the section, and a little nearer to or farther from the edge, the place with the strongest texture
     and without highlight is taken: the texture is what the point is followed by. `foreign` (h, w) is where
-    the picture, made smaller by `scale`, shows what is no tissue; no place beside it is taken.
+    the picture, made smaller by `scale`, shows what is no tissue, and `instruments` (h, w) the part of it
+    that is not glare (all of it if not given); no place beside them is taken.
     """
-    near = cv2.dilate(foreign.astype(np.uint8), np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)) > 0
+    near = _grown(foreign if instruments is None else instruments, AWAY) | _grown(foreign, AWAY_FROM_GLARE)
     gap = _level(grey, section.centre)
     chosen = []
     for index, sign in enumerate((-1.0, 1.0)):
@@ -90,6 +98,12 @@ def choose_points(
             return None
         chosen.append(best)
     return chosen
+
+
+def _grown(mask: Mask, margin: int) -> Mask:
+    """A mask (h, w) with a margin [px] around it."""
+    side = 2 * margin + 1
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _is_clear(pixel: Array, near: Mask, scale: float) -> bool:
