@@ -33,4 +33,6 @@ def warm_up() -> EdgeStatus:
     status = EdgeStatus.UNKNOWN
     for k in range(4):
         status = detector.process(1 + 16_666_667 * k, picture(2 * k), camera).status
+    # Used once there are poses.
+    camera.pixels(camera.bearings([[0.0, 0.0]]))
     return status

@@ -13,7 +13,7 @@ from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 from knee_gap_perception.image.instruments_and_glare import foreign_bodies, least_warmth
-from knee_gap_perception.image.shafts import ShaftFinder
+from knee_gap_perception.image.shafts import find_shafts
 from knee_gap_perception.point_tracking.point_selection import AWAY
 
 WIDTH, HEIGHT, RADIUS = 1280, 720, 355
@@ -106,7 +106,7 @@ def reduced_mask(mask: Mask, margin: int = 0) -> Mask:
 
 def shafts_in(image: Image) -> Mask:
     small = reduced(image)
-    return ShaftFinder().find(small, brightness(small), FIELD, SCALE, least_warmth(image))
+    return find_shafts(small, brightness(small), FIELD, SCALE, least_warmth(image))
 
 
 def decided(image: Image) -> tuple[EdgeStatus, Array]:

@@ -20,7 +20,7 @@ from knee_gap_perception.image.instruments_and_glare import (
     least_warmth,
     metal_and_glare,
 )
-from knee_gap_perception.image.shafts import ShaftFinder
+from knee_gap_perception.image.shafts import find_shafts
 from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the image is too dark
@@ -61,7 +61,6 @@ class GapSearch:
         self.confidence = float("nan")
         self._segmentation = segmentation_named(parameters.segmentation, **_settings(parameters))
         self._evidence = ConfidenceFilter()
-        self._shafts = ShaftFinder()
         self._warmth = USUAL_LIMIT
         self._warmth_age = 0
 
@@ -160,7 +159,7 @@ class GapSearch:
         `small` (h, w, 3) is the image reduced by `scale`, `value` (h, w) its brightness.
         """
         warmth = least_warmth(picture)
-        shafts = self._shafts.find(small, value, field, scale, warmth)
+        shafts = find_shafts(small, value, field, scale, warmth)
         metal, glare = metal_and_glare(small, warmth)
         instruments = metal | shafts
         return instruments | glare, instruments, shafts

@@ -48,61 +48,57 @@ class _Edge(NamedTuple):
     length: float
 
 
-class ShaftFinder:
-    """Finds the shafts of instruments in images at working size."""
+def find_shafts(image: Image, value: Image, field: FieldOfView, scale: float, warmth: float) -> Mask:
+    """Pixels (h, w) of an image (h, w, 3), `scale` times the full size, that show shafts.
 
-    def __init__(self) -> None:
-        self._segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, REDUCTION)
+    `value` (h, w) is its brightness, `warmth` the least of tissue (`least_warmth`).
+    """
+    found = np.zeros(value.shape, np.uint8)
+    centre, radius = (np.array(field.centre) + 0.5) * scale - 0.5, field.extent * scale
+    edges = _edges(value, centre, radius)
+    for index, edge in enumerate(edges):
+        for other in edges[index + 1 :]:
+            band = _band(edge, other, radius)
+            if band is not None and _is_shaft(band[0], image, value, centre, radius, warmth):
+                cv2.fillConvexPoly(found, np.rint(band[1]).astype(np.int32), (1,))
+    if found.any():
+        found = np.asarray(cv2.dilate(found, np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)))
+    return found > 0
 
-    def find(self, image: Image, value: Image, field: FieldOfView, scale: float, warmth: float) -> Mask:
-        """Pixels (h, w) of an image (h, w, 3), `scale` times the full size, that show shafts.
 
-        `value` (h, w) is its brightness, `warmth` the least of tissue (`least_warmth`).
-        """
-        found = np.zeros(value.shape, np.uint8)
-        centre, radius = (np.array(field.centre) + 0.5) * scale - 0.5, field.extent * scale
-        edges = self._edges(value, centre, radius)
-        for index, edge in enumerate(edges):
-            for other in edges[index + 1 :]:
-                band = _band(edge, other, radius)
-                if band is not None and _is_shaft(band[0], image, value, centre, radius, warmth):
-                    cv2.fillConvexPoly(found, np.rint(band[1]).astype(np.int32), (1,))
-        if found.any():
-            found = np.asarray(cv2.dilate(found, np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)))
-        return found > 0
-
-    def _edges(self, value: Image, centre: Array, radius: float) -> list[_Edge]:
-        """The longest straight edges inside the field."""
-        first = np.clip(np.floor(centre - radius), 0, None).astype(int)
-        last = np.ceil(centre + radius).astype(int) + 1
-        part = np.ascontiguousarray(value[first[1] : last[1], first[0] : last[0]])
-        # None if there is no segment.
-        segments = np.array(self._segments.detect(part)[0], dtype=np.float64, ndmin=1)
-        if np.isnan(segments).any():
-            return []
-        ends = segments.reshape(-1, 2, 2) + first
-        steps = ends[:, 1] - ends[:, 0]
-        length = np.hypot(steps[:, 0], steps[:, 1])
-        # The rim itself is no edge.
-        away = np.hypot(*(ends.mean(axis=1) - centre).T)
-        kept = (length > SHORTEST_PIECE * radius) & (away < RIM * radius)
-        ends, length, along = ends[kept], length[kept], steps[kept] / length[kept, None]
-        starts = np.argsort(-length, kind="stable")[: (length >= SHORTEST_START * radius).sum()]
-        normals = np.stack([-along[starts, 1], along[starts, 0]])
-        # How far either end of each piece (n, 2) lies from the line through each start (starts).
-        off = np.abs(ends @ normals - (ends[starts, 0] * normals.T).sum(axis=1)).max(axis=1)
-        places = ends @ along[starts].T
-        on_line = off < OFF_LINE
-        free = np.ones(len(length), bool)
-        edges: list[_Edge] = []
-        for index, start in enumerate(starts):
-            pieces = free & on_line[:, index]
-            if free[start] and length[pieces].sum() > SHORTEST_EDGE * radius:
-                reach = places[pieces, :, index]
-                if reach.max() - reach.min() > SHORTEST_SHAFT * radius:
-                    free &= ~pieces
-                    edges.append(_line_through(ends[pieces], length[pieces], along[start]))
-        return edges[:MOST_EDGES]
+def _edges(value: Image, centre: Array, radius: float) -> list[_Edge]:
+    """The longest straight edges inside the field."""
+    first = np.clip(np.floor(centre - radius), 0, None).astype(int)
+    last = np.ceil(centre + radius).astype(int) + 1
+    part = np.ascontiguousarray(value[first[1] : last[1], first[0] : last[0]])
+    # None if there is no segment.
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, REDUCTION)
+    segments = np.array(detector.detect(part)[0], dtype=np.float64, ndmin=1)
+    if np.isnan(segments).any():
+        return []
+    ends = segments.reshape(-1, 2, 2) + first
+    steps = ends[:, 1] - ends[:, 0]
+    length = np.hypot(steps[:, 0], steps[:, 1])
+    # The rim itself is no edge.
+    away = np.hypot(*(ends.mean(axis=1) - centre).T)
+    kept = (length > SHORTEST_PIECE * radius) & (away < RIM * radius)
+    ends, length, along = ends[kept], length[kept], steps[kept] / length[kept, None]
+    starts = np.argsort(-length, kind="stable")[: (length >= SHORTEST_START * radius).sum()]
+    normals = np.stack([-along[starts, 1], along[starts, 0]])
+    # How far either end of each piece (n, 2) lies from the line through each start (starts).
+    off = np.abs(ends @ normals - (ends[starts, 0] * normals.T).sum(axis=1)).max(axis=1)
+    places = ends @ along[starts].T
+    on_line = off < OFF_LINE
+    free = np.ones(len(length), bool)
+    edges: list[_Edge] = []
+    for index, start in enumerate(starts):
+        pieces = free & on_line[:, index]
+        if free[start] and length[pieces].sum() > SHORTEST_EDGE * radius:
+            reach = places[pieces, :, index]
+            if reach.max() - reach.min() > SHORTEST_SHAFT * radius:
+                free &= ~pieces
+                edges.append(_line_through(ends[pieces], length[pieces], along[start]))
+    return edges[:MOST_EDGES]
 
 
 def _line_through(ends: Array, length: Array, along: Array) -> _Edge:
