@@ -19,7 +19,7 @@ INSETS = (0.75, 1.0, 1.25)  # of the inset that is asked for
 PATCH_HALF = 24  # [px] half side of the piece of tissue that is judged
 MINIMUM_TISSUE = 0.4  # share of that piece that must be tissue without highlight
 AWAY = 12  # [px at working size] from instruments: half of what a point is followed by
-AWAY_FROM_GLARE = 2  # [px at working size]: what is followed of a place leaves out its highlights
+AWAY_FROM_GLARE = 6  # [px at working size]: glare is left out of what is followed, but moves with the lamp
 MOST_OF_A_BLOCK = (
     1.5  # of the median block's texture that one block counts: drifting debris is texture as well
 )
