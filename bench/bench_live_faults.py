@@ -302,15 +302,15 @@ class Room:
         died = self.died()
         self.failed = bool(wrong or died)
         worst = f"{len(wrong)}, by {1e3 * max(wrong, default=0.0):.2f} mm"
-        told = f"{1e3 * self._told(fault, estimates):.0f} ms" if fault.blind else "-"
+        delay = f"{1e3 * self._delay_of_status(fault, estimates):.0f} ms" if fault.blind else "-"
         again = next((one.time - fault.end for one in valid if one.time > fault.end), np.nan)
         recovery = f"{again:.1f} s" if fault.name != "nothing" else "-"
         return (
-            f"| {fault.name} | {len(valid)} of {len(estimates)} | {worst} | {told} | {recovery} | "
+            f"| {fault.name} | {len(valid)} of {len(estimates)} | {worst} | {delay} | {recovery} | "
             f"{', '.join(died) or '0'} |"
         )
 
-    def _told(self, fault: Fault, estimates: list[Heard]) -> float:
+    def _delay_of_status(self, fault: Fault, estimates: list[Heard]) -> float:
         """Time from the begin of a fault to a status that is not VALID, or to a noticed silence [s]."""
         before = max((one.time for one in estimates if one.time <= fault.begin), default=fault.begin)
         for one in estimates:

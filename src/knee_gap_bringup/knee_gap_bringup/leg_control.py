@@ -28,7 +28,7 @@ MOST_TRACKS = 4096
 REQUEST_PERIOD = 0.5
 MOST_REQUESTS = 10
 
-ANEW = "the joint may have moved since this track began"
+MAY_HAVE_MOVED = "the joint may have moved since this track began"
 
 
 class Action(StrEnum):
@@ -315,7 +315,7 @@ class LegControl:
 
     def _request_again(self, command: Command, estimate: Estimate, now: float) -> Command:
         """Hold the leg for an estimate of an old track; request a new one again if the old one continues."""
-        command = hold(ANEW) if estimate.is_valid else command
+        command = hold(MAY_HAVE_MOVED) if estimate.is_valid else command
         if estimate.track_id == 0 or now - self._requested < REQUEST_PERIOD:
             return command
         if self._requests >= MOST_REQUESTS:

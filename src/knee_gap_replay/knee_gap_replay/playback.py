@@ -49,8 +49,8 @@ def window(
 ) -> Iterator[BagMessage]:
     """Yield the messages from a time on and before another.
 
-    Of the `latched` topics, whoever comes at `begin_ns` would have got the last message before it: it is
-    given first, at that time.
+    Of the `latched` topics, a subscriber that joins at `begin_ns` would have received the last message before
+    it: that one is given first, at that time.
     """
     kept: dict[str, BagMessage] = {}
     for message in messages:
@@ -84,7 +84,7 @@ def read_ahead(messages: Iterable[BagMessage], stop: threading.Event) -> Iterato
                 if ended.is_set() or stop.is_set():
                     break
                 waiting.put(message)
-        except BaseException as error:  # raised again by whoever takes the messages
+        except BaseException as error:  # raised again where the messages are taken
             waiting.put(error)
         waiting.put(None)
 

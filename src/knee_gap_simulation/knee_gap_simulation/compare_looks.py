@@ -14,7 +14,7 @@ from knee_gap_simulation.contact_sheet import moment, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import LEVELS
 from knee_gap_simulation.looks.look import Appearance
-from knee_gap_simulation.looks.statistics import known, table, told_apart
+from knee_gap_simulation.looks.statistics import known, separability, table
 
 _LEAST = 8
 _MOST_OF_A_VIDEO = 6
@@ -35,13 +35,12 @@ def compared(seeds: Sequence[int], real: Array | None) -> str:
     if real is not None:
         lines.append("")
         for name, values in groups.items():
-            lines.append(
-                f"told from pictures, {name}: {100.0 * told_apart(values, real):.0f} % (chance 50 %)"
-            )
+            rate = separability(values, real)
+            lines.append(f"distinguished from pictures, {name}: {100.0 * rate:.0f} % (chance 50 %)")
         half = np.arange(len(real)) % 2 == 0
         if min(half.sum(), (~half).sum()) >= _LEAST:
-            rate = told_apart(real[half], real[~half])
-            lines.append(f"told apart, every other picture from the rest: {100.0 * rate:.0f} %")
+            rate = separability(real[half], real[~half])
+            lines.append(f"distinguished, every other picture from the rest: {100.0 * rate:.0f} %")
     return "\n".join(lines)
 
 

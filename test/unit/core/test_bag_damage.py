@@ -117,7 +117,7 @@ def test_messages_of_a_topic_whose_announcement_is_lost_are_lost_and_told(
     # Killed in its third chunk, and its first, the only one with definitions, damaged.
     messages, losses = read(tmp_path / "killed.mcap", flipped[: content.index(original[40].data)])
     assert messages == []
-    assert any("16 messages at byte" in line and "topic is not told" in line for line in losses)
+    assert any("16 messages at byte" in line and "topic is unknown" in line for line in losses)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from knee_gap_simulation.knee.difficulty import Difficulty, conditions
 from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.looks.border import field_border
 from knee_gap_simulation.looks.look import Appearance, Look
-from knee_gap_simulation.looks.statistics import FEATURES, features, told_apart
+from knee_gap_simulation.looks.statistics import FEATURES, features, separability
 from knee_gap_simulation.looks.video import tone
 from knee_gap_simulation.make_bag import main
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
@@ -126,8 +126,8 @@ def test_a_board_has_no_look(tmp_path, capsys):
 def test_the_classifier_tells_different_pictures_apart_and_equal_ones_not():
     rng = np.random.default_rng(3)
     a, b = rng.standard_normal((2, 60, 5))
-    assert abs(told_apart(a, b) - 0.5) < 0.12
-    assert told_apart(a, b + 3.0) > 0.95
+    assert abs(separability(a, b) - 0.5) < 0.12
+    assert separability(a, b + 3.0) > 0.95
 
 
 def test_features_follow_colour_and_light():

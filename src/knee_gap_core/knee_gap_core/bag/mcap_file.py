@@ -87,7 +87,7 @@ class McapFile:
         self.path = path
         self._salvage = salvage
         self.losses: list[str] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -126,7 +126,7 @@ class McapFile:
         known = [message for message in messages if message.channel_id in self.channels]
         if len(known) < len(messages):
             self._lose(
-                f"{len(messages) - len(known)} messages at byte {block.offset} lost: their topic is not told"
+                f"{len(messages) - len(known)} messages at byte {block.offset} lost: their topic is unknown"
             )
         return [self._entry(message) for message in known]
 
@@ -264,7 +264,7 @@ class McapFile:
     def _peek_definitions(self, block: Block) -> None:
         try:
             self._note_definitions(self._records(block))
-        except Exception:  # told when the block is read
+        except Exception:  # reported when the block is read
             return
 
     def _note_definitions(self, records: Iterable[McapRecord]) -> None:
@@ -276,8 +276,8 @@ class McapFile:
 
     def _lose(self, what: str) -> None:
         line = f"{self.path.name}: {what}"
-        if line not in self._told:  # read again, it is lost again
-            self._told.add(line)
+        if line not in self._reported:  # read again, it is lost again
+            self._reported.add(line)
             self.losses.append(line)
             _LOG.warning(line)
 

@@ -210,7 +210,7 @@ class EdgeStream:
         """Drop the images before the newest that need not wait, if the first of them lags too far behind it.
 
         A live node that is starved calls this before `ready`: the newest image is worth more than the oldest.
-        Ages are told by the images' own stamps. Returns how many were dropped; they get no edges.
+        Ages are differences of the images' own stamps. Returns how many were dropped; they get no edges.
         """
         free = 0
         while free < len(self._waiting) and not self._must_wait(self._waiting[free], now_ns):

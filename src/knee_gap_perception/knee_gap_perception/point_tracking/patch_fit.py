@@ -13,7 +13,7 @@ NOISE_CORRELATION = 2.7  # factor on the variance: the residuals of neighbouring
 MAXIMUM_ITERATIONS = 12
 CONVERGED = 0.02  # [px]
 FINISHING = 2  # iterations in which only gradients count that both textures have
-BLOCKS = 3  # a side, in which that is told apart
+BLOCKS = 3  # a side, for each of which that is decided
 CHANCE = 0.1  # [-] share of them, and correlation, that two textures of mere noise have in common
 LEAST_LIKENESS = 0.02  # [-] of textures that have nothing in common
 
@@ -23,7 +23,7 @@ def likeness(correlation: float) -> float:
     """Share of the information on a shift that counts, of textures that correlate so.
 
     The noise of both textures makes gradients that say nothing, and may lock onto each other. Found on the
-    simulated knee, where what registrations add to the error was told apart from what grows with the
+    simulated knee, where what registrations add to the error was separated from what grows with the
     parallax: the variance goes as the inverse of the correlation beyond chance.
     """
     return min(max((correlation - CHANCE) / (1.0 - CHANCE), LEAST_LIKENESS), 1.0)

@@ -105,7 +105,7 @@ def _stamp_of(step: _Step) -> int:
 
 
 def _first_stage(reader: BagReader, pipeline: GapPipeline, theirs: Connection, ours: Connection) -> None:
-    """Run in a process of its own; whoever reads may end at any time, and this process with it."""
+    """Run in a process of its own; the reader may end at any time, and this process with it."""
     # Ctrl-C goes to both processes; the one that writes ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -63,7 +63,7 @@ def features(image: ByteImage) -> Array:
     )
 
 
-def told_apart(first: Array, second: Array, seed: int = 0) -> float:
+def separability(first: Array, second: Array, seed: int = 0) -> float:
     """Cross-validated balanced accuracy of a linear discriminant between features (n, k) and (m, k).
 
     0.5 is chance. The discriminant is shrunk, since there are few pictures; folds are drawn several times.

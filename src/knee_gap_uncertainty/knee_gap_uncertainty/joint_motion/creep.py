@@ -101,16 +101,16 @@ def creep_statistic(
     if not cholesky(noise, factor):
         return statistic, DEVIATIONS * rates[1]
     # left = known c + e with e of the covariance `noise`: the posterior of c along the baseline.
-    told = np.zeros((3, 3))
+    solved = np.zeros((3, 3))
     for k in range(3):
-        solve_factored(factor, known[:, k].copy(), told[:, k])
-    posterior = known @ told
+        solve_factored(factor, known[:, k].copy(), solved[:, k])
+    posterior = known @ solved
     for k in range(3):
         posterior[k, k] += 1.0 / max(rates[1], TINY) ** 2
     if not cholesky(posterior, factor):
         return statistic, DEVIATIONS * rates[1]
     along = baseline / length
-    solve_factored(factor, told.T @ left, solution)
+    solve_factored(factor, solved.T @ left, solution)
     solve_factored(factor, along, spread)
     rate = abs(np.sum(solution * along)) + DEVIATIONS * np.sqrt(np.sum(spread * along))
     return statistic, rate
