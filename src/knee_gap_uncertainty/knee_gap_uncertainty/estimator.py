@@ -22,6 +22,7 @@ from knee_gap_uncertainty.inputs.delays import DelayFloor
 from knee_gap_uncertainty.inputs.leg_body import LegBody
 from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer, PoseRefusal
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal, ScopeRotation, ScopeRotations
+from knee_gap_uncertainty.inputs.silence import Silence
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice.advice_task import PIECES, AdviceTask
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice, Situation
@@ -82,7 +83,7 @@ class GapEstimator:
         # By how much the clock was ahead of the stamps of the latest poses: what an image's delay is held to.
         self._delays = DelayFloor()
         self._last_edges: Pending | None = None
-        self._silence_reported_ns = 0
+        self._silence = Silence(self.parameters.max_edges_silence)
         self._now_ns = 0
 
     @property
@@ -156,7 +157,7 @@ class GapEstimator:
             self._delays.clear()
             self._track = None
         self._last_edges = Pending(edges, arrival_ns)
-        self._silence_reported_ns = arrival_ns
+        self._silence.add_image(edges.stamp_ns, arrival_ns)
         if len(self._pending) == MOST_PENDING:
             self.counts["images dropped while waiting for poses"] += 1
             self._pending.popleft()
@@ -179,15 +180,15 @@ class GapEstimator:
         estimates = self._resolve(now_ns)
         if self._pending or (self._last_edges is None and not self._is_live):
             return estimates
-        if now_ns - self._silence_reported_ns > self.parameters.max_edges_silence * NANOSECONDS:
-            estimates.append(self._silence(now_ns))
+        if self._silence.is_due(now_ns):
+            estimates.append(self._silent(now_ns))
         return estimates
 
     def begin(self, now_ns: int) -> list[GapEstimate]:
         """Begin to measure live: stamps are held to the clock, and silence is reported from now on."""
         self._is_live = True
         self._now_ns = now_ns
-        return [self._silence(now_ns)]
+        return [self._silent(now_ns)]
 
     def leaving(self, estimate: GapEstimate, now_ns: int) -> GapEstimate:
         """An estimate as it leaves at a time [ns]: without numbers if its image is too long ago by then."""
@@ -197,9 +198,9 @@ class GapEstimator:
         verdict = judge(Facts(self.parameters, delay=delay))
         return self._without(estimate.stamp_ns, estimate.track_id, verdict) if verdict else estimate
 
-    def _silence(self, now_ns: int) -> GapEstimate:
+    def _silent(self, now_ns: int) -> GapEstimate:
         """Statement that no image comes."""
-        self._silence_reported_ns = now_ns
+        self._silence.report(now_ns)
         last = self._last_edges
         # The only stamp that is not an image's: no image came, and the statement needs a time.
         stamp_ns = now_ns if last is None else last.edges.stamp_ns + now_ns - last.arrival_ns
@@ -230,7 +231,7 @@ class GapEstimator:
             self._delays.clear()
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
-                self._silence_reported_ns = now_ns
+                self._silence.restart(now_ns)
         self._now_ns = now_ns
 
     def _resolve(self, now_ns: int) -> list[GapEstimate]:

@@ -85,9 +85,10 @@ class EstimatorParameters:
         },
     )
     max_edges_silence: float = field(
-        default=0.05,
+        default=0.03,
         metadata={
-            "description": "time without edges after which NO_EDGES is published [s]",
+            "description": "time beyond the usual interval between images after which NO_EDGES is "
+            "published [s]",
             "range": (0.01, 10.0),
         },
     )
