@@ -23,12 +23,12 @@ from tqdm import tqdm
 
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.edge_messages import edges_from_message, fill_gap_edges
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.models import FisheyeCamera, bearing_jacobian
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
-from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_lens_pose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
@@ -155,7 +155,7 @@ class GapCheck:
         )
         now = edges.stamp_ns
         estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
-        estimates += self._estimator.add_edges(messages.edges_from_message(seen), now)
+        estimates += self._estimator.add_edges(edges_from_message(seen), now)
         for estimate in estimates:
             if estimate.status is GapStatus.VALID:
                 self._judge(estimate, scores)

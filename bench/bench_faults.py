@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeState, GapEstimate, GapStatus
+from knee_gap_core.values.edges import EdgeState
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rigid_transforms import rigid
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_replay.pipeline import PARAMETERS, GapPipeline

@@ -34,7 +34,8 @@ from knee_gap_bringup.demo import NAMESPACE, START_TIMEOUT, scope_arguments
 from knee_gap_bringup.launching.plan import NODES
 from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_core.bag.bag import BagReader
-from knee_gap_core.values.gap_estimate import EdgeState, GapStatus
+from knee_gap_core.values.edges import EdgeState
+from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_msgs.msg import GapEdges, GapEstimate
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE
 

@@ -12,13 +12,15 @@ error with the conversion at a perfect window is above 1 %, or a valid estimate 
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera_errors import WINDOW_TILT, CameraErrors, pupil_shift
 from knee_gap_perception.camera.medium import AIR, SALINE
@@ -162,9 +164,8 @@ def track(rng: np.random.Generator, way: Way, depth: float, travel: float, arm: 
             jacobians = [bearing_jacobian(camera, pixel) for pixel in pixels]
             covariances = np.array([PIXEL_NOISE**2 * j @ j.T for j in jacobians])
             bound = 3.0 * PIXEL_NOISE * max(camera.radians_per_pixel(pixel) for pixel in pixels)
-            edges = EdgeObservation(
-                stamp, 1, True, bearings, covariances, bound, camera_errors=way.errors.of(bearings)
-            )
+            edges = GapEdges.of_points(stamp, 1, bearings, covariances, bound)
+            edges = replace(edges, camera_errors=way.errors.of(bearings))
             reported += estimator.add_edges(edges, stamp)
     return reported
 

@@ -18,7 +18,8 @@ from tqdm import tqdm
 
 from knee_gap_bringup.leg_control import Action, Estimate, LegControl, LegParameters
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator
@@ -68,7 +69,7 @@ class Run:
         first = self._simulator.pose(float(self._times[0]))
         self._points = points_beside(scene, first, self._edges(first))
 
-    def views(self) -> Iterator[tuple[EdgeObservation, LensPose, float]]:
+    def views(self) -> Iterator[tuple[GapEdges, LensPose, float]]:
         """Observation, tracked lens pose and true gap [m] of each image."""
         for time in self._times:
             T_scene_lens = self._simulator.pose(float(time))

@@ -1,14 +1,11 @@
-"""Conversion of messages to images and poses, and of edges to messages, by field name, for any class."""
+"""Conversion of messages to images and lens poses, by field name, for any class of message."""
 
-from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Image
-from knee_gap_core.values.edges import GapEdges, SectionEdges
 from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
@@ -95,51 +92,3 @@ def lens_pose_from_message(message: Any) -> LensPose:
         quaternion_xyzw=quaternion,
         covariance=covariance,
     )
-
-
-def fill_gap_edges(message: Any, edges: GapEdges, blank_section: Callable[[], Any]) -> Any:
-    """Set every field of a default-constructed knee_gap_msgs/GapEdges from edges; returns the message.
-
-    `blank_section` makes a default-constructed knee_gap_msgs/GapSection of the same kind.
-    """
-    seconds, nanoseconds = divmod(edges.stamp_ns, 1_000_000_000)
-    message.header.stamp.sec = seconds
-    message.header.stamp.nanosec = nanoseconds
-    message.header.frame_id = edges.frame_id
-    message.status = int(edges.status)
-    message.track_id = int(edges.track_id)
-    for index in (0, 1):
-        bearing = getattr(message, f"bearing_{index}")
-        bearing.x, bearing.y, bearing.z = (float(value) for value in edges.bearings[index])
-        setattr(message, f"pixel_{index}", np.array(edges.pixels[index], dtype=np.float64))
-        setattr(message, f"kind_{index}", int(edges.kinds[index]))
-        setattr(message, f"hidden_{index}", bool(edges.hidden[index]))
-        setattr(
-            message, f"covariance_{index}", np.array(edges.covariances[index], dtype=np.float64).reshape(9)
-        )
-        setattr(message, f"camera_error_{index}", _camera_error(edges.camera_errors[index]))
-        setattr(message, f"edge_state_{index}", int(edges.section.states[index]))
-        setattr(message, f"edge_pixel_{index}", np.array(edges.section.pixels[index], dtype=np.float64))
-        setattr(message, f"edge_deviation_{index}", float(edges.section.deviations[index]))
-    _fill_section(message, edges.section)
-    message.sections = [_fill_section(blank_section(), section) for section in edges.sections]
-    message.pose_used = bool(edges.pose_used)
-    message.angular_error = float(edges.angular_error)
-    return message
-
-
-def _fill_section(message: Any, section: SectionEdges) -> Any:
-    """Set the bearings of both edges and the bound of their errors."""
-    for index in (0, 1):
-        edge = getattr(message, f"edge_{index}")
-        edge.x, edge.y, edge.z = (float(value) for value in section.bearings[index])
-    message.edge_error = float(section.error)
-    return message
-
-
-def _camera_error(errors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Displacements (3, k), at most nine, in the message's layout (27,); NaN if there are none."""
-    count = errors.shape[1]
-    padded = np.full((3, 9), 0.0 if count else np.nan)
-    padded[:, :count] = errors
-    return padded.ravel()

@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 from knee_gap_core.node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, BaseNode, run
 from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.node.seam import Fault
+from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_core.values.edges import GapEdges as Edges
 from knee_gap_msgs.msg import GapEdges, GapSection, ScopeCalibration, ScopeNotch
@@ -28,7 +29,6 @@ from knee_gap_perception.edge_tracking.parameters import (
 )
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
-from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import fill_scope_calibration, fill_scope_notch
 from knee_gap_perception.warm_up import warm_up
 

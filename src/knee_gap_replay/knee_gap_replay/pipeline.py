@@ -15,6 +15,7 @@ from knee_gap_core.bag.message_types import blank
 from knee_gap_core.bag.qos import QosName
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.node.seam import Fault, Seam
+from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp
@@ -24,7 +25,6 @@ from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import CameraInfoParameters, PoseParameters
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
-from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
     fill_scope_calibration,

@@ -4,14 +4,14 @@ The bearings of two true points of the anatomy and of the true edges are wrong b
 stated covariances, and so is the pose of the lens.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
+from knee_gap_core.values.edges import EdgeKind, EdgeState, GapEdges, SectionEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.recordings.section_truth import Scene, edges_at_section
@@ -20,7 +20,6 @@ from knee_gap_simulation.scope.lens import Lens
 # How far beside the edges the two points lie.
 INSET = np.radians(2.0)
 # Codes of knee_gap_msgs/GapEdges: the upper edge is the contour of the condyle, the lower one a rim.
-KIND_RIM, KIND_CONTOUR = 1, 2
 # A direction in the scene is taken to the image over this length [m].
 _STEP = 1e-4
 
@@ -80,7 +79,7 @@ class ViewDrawer:
 
     def observation(
         self, stamp_ns: int, T_scene_lens: Array, points: Array, edges: Array, track_id: int = 1
-    ) -> EdgeObservation:
+    ) -> GapEdges:
         """Two points (2, 3) of the scene and edges (2, 3) of the lens, as segmentation_node reports them."""
         errors = self.errors
         seen = (points - T_scene_lens[:3, 3]) @ T_scene_lens[:3, :3]
@@ -94,15 +93,11 @@ class ViewDrawer:
             for edge in edges
         ]
         outer = bearings[..., :, None] * bearings[..., None, :]
-        return EdgeObservation(
-            stamp_ns,
-            track_id,
-            True,
-            bearings,
-            errors.point**2 * (np.eye(3) - outer),
-            angular_error=3.0 * errors.point,
-            kinds=(KIND_CONTOUR, KIND_RIM),
-            section=EdgeSection(
+        covariances = errors.point**2 * (np.eye(3) - outer)
+        return replace(
+            GapEdges.of_points(stamp_ns, track_id, bearings, covariances, angular_error=3.0 * errors.point),
+            kinds=(EdgeKind.CONTOUR, EdgeKind.RIM),
+            section=SectionEdges(
                 (EdgeState.SEEN, EdgeState.SEEN), np.array(turned), np.full(2, errors.edge), 3.0 * errors.edge
             ),
         )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.errors import (
     BaselineTooShortError,
     CheiralityError,
@@ -20,7 +21,7 @@ from knee_gap_core.values.errors import (
     MeasurementError,
     UnderconstrainedError,
 )
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.rejection import Rejection
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
@@ -97,7 +98,7 @@ class Facts:
     fault: str = ""
     is_silent: bool = False
     is_first_awaited: bool = False
-    edges: EdgeObservation | None = None
+    edges: GapEdges | None = None
     edges_flaw: str = ""
     clock_offset: float = float("nan")
     delay: float = 0.0
@@ -167,7 +168,7 @@ RULES: tuple[Rule, ...] = (
         lambda f: f.edges is not None and not f.edges.usable,
         detail=lambda f: f.edges_flaw,
     ),
-    Rule(Reason.HIDDEN, GapStatus.NO_EDGES, lambda f: f.edges is not None and f.edges.hidden),
+    Rule(Reason.HIDDEN, GapStatus.NO_EDGES, lambda f: f.edges is not None and any(f.edges.hidden)),
     Rule(Reason.BAD_EDGES, GapStatus.NO_EDGES, lambda f: bool(f.edges_flaw), detail=lambda f: f.edges_flaw),
     Rule(Reason.FAR_FROM_CLOCK, GapStatus.OUT_OF_SYNC, _is_far_from_clock),
     Rule(Reason.NO_POSE_FOLLOWS, GapStatus.TRACKING_LOST, lambda f: f.pose is PoseRefusal.NOT_YET),

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.errors import MeasurementError
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_uncertainty.acceptance import Facts, Verdict, judge
@@ -43,7 +44,7 @@ MOST_ADVICE = 16
 class Pending(NamedTuple):
     """Edges that wait for the lens pose after them, and when they arrived [ns]."""
 
-    edges: EdgeObservation
+    edges: GapEdges
     arrival_ns: int
 
 
@@ -143,7 +144,7 @@ class GapEstimator:
             # Views by another calibration are not comparable with those before.
             self._track = None
 
-    def add_edges(self, edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
+    def add_edges(self, edges: GapEdges, arrival_ns: int) -> list[GapEstimate]:
         """Take the edges of one image; return the estimates that are ready."""
         self._turn_clock(arrival_ns)
         last = self._last_edges
@@ -271,7 +272,7 @@ class GapEstimator:
         """Whether somebody tells, or says that he will, how far the scope is turned in its camera head."""
         return self._rotation_reported or any(one.rotation_followed for one in self.calibrations.values())
 
-    def _measure(self, facts: Facts, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
+    def _measure(self, facts: Facts, edges: GapEdges, pose: LensPose) -> GapEstimate:
         """Estimate from the edges and their lens pose, within the track that they belong to."""
         if self.calibration_flaw:
             self._track = None

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
+from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.errors import BaselineTooShortError, MeasurementError
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.acceptance import Facts, Kept, judge
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
@@ -91,7 +92,7 @@ class Track:
         # Of the present image, where it shows more sections and the gap is valid.
         self.profile: GapProfile | None = None
 
-    def continues_with(self, edges: EdgeObservation, pose: LensPose) -> bool:
+    def continues_with(self, edges: GapEdges, pose: LensPose) -> bool:
         """Whether the edges are of the same points and camera, and the pose continues the earlier ones."""
         same = edges.track_id == self.track_id and pose.frame_id == self.frame_id
         # Errors of a camera are comparable with those of the same camera only.
@@ -102,7 +103,7 @@ class Track:
         """Whether the lens made a step, or was lost, between the track's views and this pose."""
         return self._first is not None and pose.segment != self._segment
 
-    def add(self, edges: EdgeObservation, pose: LensPose) -> GapEstimate:
+    def add(self, edges: GapEdges, pose: LensPose) -> GapEstimate:
         """Take the next view and return the estimate at it."""
         self.profile = None
         blank = GapEstimate(
@@ -209,7 +210,7 @@ class Track:
             self._direction = travel / length
 
     def _situation(
-        self, edges: EdgeObservation, present: PosedView, all_views: AllViews, section: Edges | str
+        self, edges: GapEdges, present: PosedView, all_views: AllViews, section: Edges | str
     ) -> Situation | None:
         """What advice on motion can be based on; None while the points or the edges are not known at all."""
         assert self._first is not None
@@ -264,7 +265,7 @@ class Track:
     def _measured(
         self,
         blank: GapEstimate,
-        observation: EdgeObservation,
+        observation: GapEdges,
         view: PosedView,
         bounds: GapRange,
         parallax: float,
@@ -329,7 +330,7 @@ class Track:
     def _with_gap(
         self,
         measured: GapEstimate,
-        observation: EdgeObservation,
+        observation: GapEdges,
         view: PosedView,
         fitted: MultiViewFit,
         opening: Opening,
@@ -374,7 +375,7 @@ class Track:
 
     def _profile(
         self,
-        observation: EdgeObservation,
+        observation: GapEdges,
         view: PosedView,
         fitted: MultiViewFit,
         near_far: tuple[Floats, Floats],

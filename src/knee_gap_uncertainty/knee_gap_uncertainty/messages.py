@@ -1,12 +1,11 @@
-"""Messages to observations and estimates to messages, by field name: any classes with those fields serve."""
+"""Conversion of messages to poses and calibrations, and of estimates to messages, by field name."""
 
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState, GapEstimate
+from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
@@ -14,7 +13,6 @@ from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters, MotionAdvice
 from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
-VALID_EDGES = 1
 TARGETS = {"snr": 0, "width": 1}
 INTERVALS = {"worst_case": 0, "paper": 1}
 SHARES = (
@@ -27,49 +25,6 @@ SHARES = (
 )
 # Plain numbers of GapEstimate, under the same name in the message.
 NUMBERS = tuple(field.name for field in fields(GapEstimate) if field.type is float)
-
-
-def edges_from_message(message: Any) -> EdgeObservation:
-    """Observation of a knee_gap_msgs/GapEdges."""
-    return EdgeObservation(
-        stamp_ns=stamp_ns(message.header),
-        track_id=int(message.track_id),
-        usable=int(message.status) == VALID_EDGES and int(message.track_id) != 0,
-        bearings=np.array([[b.x, b.y, b.z] for b in (message.bearing_0, message.bearing_1)], dtype=float),
-        covariances=np.array([message.covariance_0, message.covariance_1], dtype=float).reshape(2, 3, 3),
-        angular_error=float(message.angular_error),
-        status=int(message.status),
-        frame_id=str(message.header.frame_id),
-        hidden=bool(message.hidden_0) or bool(message.hidden_1),
-        pose_used=bool(message.pose_used),
-        camera_errors=_camera_errors(message),
-        kinds=(int(message.kind_0), int(message.kind_1)),
-        section=EdgeSection(
-            states=(int(message.edge_state_0), int(message.edge_state_1)),
-            bearings=_edge_bearings(message),
-            deviations=np.array([message.edge_deviation_0, message.edge_deviation_1], dtype=float),
-            error=float(message.edge_error),
-        ),
-        sections=tuple(_section(section) for section in message.sections),
-    )
-
-
-def _edge_bearings(message: Any) -> npt.NDArray[np.float64]:
-    """Bearings (2, 3) of the edges of a knee_gap_msgs/GapEdges or GapSection."""
-    return np.array([[e.x, e.y, e.z] for e in (message.edge_0, message.edge_1)], dtype=float)
-
-
-def _section(message: Any) -> EdgeSection:
-    """Edges of a knee_gap_msgs/GapSection."""
-    bearings, error = _edge_bearings(message), float(message.edge_error)
-    state = EdgeState.SEEN if np.isfinite(bearings).all() and np.isfinite(error) else EdgeState.UNKNOWN
-    return EdgeSection((state, state), bearings, np.full(2, error / 3.0), error)
-
-
-def _camera_errors(message: Any) -> npt.NDArray[np.float64]:
-    """Errors (2, 3, k) of the camera of a knee_gap_msgs/GapEdges; k is 0 where they are not known."""
-    errors = np.array([message.camera_error_0, message.camera_error_1], dtype=float).reshape(2, 3, 9)
-    return errors[:, :, :0] if np.isnan(errors).all() else errors
 
 
 def pose_from_message(message: Any) -> LensPose:

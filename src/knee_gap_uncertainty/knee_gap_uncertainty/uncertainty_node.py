@@ -12,6 +12,7 @@ from std_msgs.msg import Float64
 from knee_gap_core.node.base_node import LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode, run
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.values import gap_estimate
+from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_msgs.msg import GapEdges, GapEstimate, GapProfile, MotionAdvice, ScopeCalibration, ScopeRotation
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.acceptance import Reason
@@ -80,7 +81,7 @@ class UncertaintyNode(BaseNode):
 
     def on_edges(self, message: GapEdges) -> None:
         """Estimate at an image."""
-        self.publish(self._estimator.add_edges(messages.edges_from_message(message), self.now_ns()))
+        self.publish(self._estimator.add_edges(edges_from_message(message), self.now_ns()))
 
     def on_pose(self, message: PoseWithCovarianceStamped, info: Mapping[str, int | None]) -> None:
         """Take a lens pose, which may complete images that waited for it."""

@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.joint_motion import motion_statistics
@@ -60,11 +61,11 @@ def _pose(stamp_ns: int, lens: "np.typing.NDArray[np.float64]") -> LensPose:
 
 def _edges(
     stamp_ns: int, lens: "np.typing.NDArray[np.float64]", points: "np.typing.NDArray[np.float64]"
-) -> EdgeObservation:
+) -> GapEdges:
     """The points as that lens sees them."""
     bearings = (points - lens) / np.linalg.norm(points - lens, axis=1, keepdims=True)
     planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
-    edges = EdgeObservation(stamp_ns, 1, True, bearings, SIGMA**2 * planes, 3.0 * SIGMA)
+    edges = GapEdges.of_points(stamp_ns, 1, bearings, SIGMA**2 * planes, 3.0 * SIGMA)
     return edges.with_rims_at_points()
 
 

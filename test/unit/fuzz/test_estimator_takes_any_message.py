@@ -10,7 +10,9 @@ from hostile import BEGIN, SETTINGS, header, hurt, numbers, poses, sequences, st
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapStatus
+from knee_gap_core.values.edge_messages import edges_from_message
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -44,6 +46,7 @@ def edges(draw: Any, stamp_ns: int) -> Any:
         setattr(message, f"camera_error_{index}", hurt(draw, np.full(27, np.nan), share=8))
         setattr(message, f"edge_{index}", vector(hurt(draw, bearings[index], share=8)))
         setattr(message, f"edge_state_{index}", draw(st.sampled_from([1] * 6 + [0, 2, 255])))
+        setattr(message, f"edge_pixel_{index}", np.array([300.0, 180.0]))
         setattr(message, f"edge_deviation_{index}", float(hurt(draw, [1e-3], share=8)[0]))
     message.edge_error = float(hurt(draw, [3e-3], share=8)[0])
     message.sections = [
@@ -77,7 +80,7 @@ def take(estimator: GapEstimator, draw: Any, stamp_ns: int, now_ns: int) -> list
         pose = messages.pose_from_message(draw(poses(stamp_ns)))
         return estimator.add_pose(pose, now_ns, draw(st.sampled_from([0, 10**7, 10**12])))
     if kind == "edges":
-        return estimator.add_edges(messages.edges_from_message(edges(draw, stamp_ns)), now_ns)
+        return estimator.add_edges(edges_from_message(edges(draw, stamp_ns)), now_ns)
     if kind == "turn":
         turn = SimpleNamespace(header=header(stamp_ns), turn=draw(numbers))
         return estimator.add_rotation(messages.rotation_from_message(turn), now_ns)
@@ -102,15 +105,12 @@ def moved() -> GapEstimator:
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
         estimator.add_edges(
-            EdgeObservation(
+            GapEdges.of_points(
                 stamp_ns=stamp,
                 track_id=1,
-                usable=True,
                 bearings=bearings,
                 covariances=1e-7 * planes,
                 angular_error=3e-3,
-                status=1,
-                frame_id="arthroscope_optical",
             ).with_rims_at_points(),
             stamp,
         )

@@ -9,10 +9,11 @@ import pytest
 from plain_messages import header
 
 from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages import fill_gap_edges, image_from_compressed, image_from_message
+from knee_gap_perception.messages import image_from_compressed, image_from_message
 
 
 @pytest.fixture

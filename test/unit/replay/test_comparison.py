@@ -8,11 +8,11 @@ import pytest
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, rigid
 from knee_gap_core.values.stamps import stamp_ns
-from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_replay.report.comparison import EDGES, GAP, Comparison, compare
 from knee_gap_simulation.make_bag import Recording, make_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE

@@ -77,7 +77,7 @@ class TrueEdges:
         nothing = GapEdges.without_points(stamp, "arthroscope_optical", EdgeStatus.VALID, track_id=1)
         planes = np.eye(3) - bearings[:, :, None] * bearings[:, None, :]
         seen = (EdgeState.SEEN, EdgeState.SEEN)
-        section = SectionEdges(seen, np.zeros((2, 2)), bearings, np.full(2, 1e-4), 3e-4)
+        section = SectionEdges(seen, bearings, np.full(2, 1e-4), 3e-4, np.zeros((2, 2)))
         return replace(
             nothing,
             bearings=bearings,

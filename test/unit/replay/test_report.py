@@ -15,10 +15,10 @@ import pytest
 
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rejection import Rejection
-from knee_gap_perception.messages import fill_gap_edges
 from knee_gap_replay.report import command
 from knee_gap_replay.report.command import _names
 from knee_gap_replay.report.figures import STATUS_COLOURS
@@ -119,7 +119,7 @@ def results(
         kinds=(EdgeKind.RIM, EdgeKind.RIM),
         covariances=np.zeros((2, 3, 3)),
         angular_error=0.01,
-        section=SectionEdges((EdgeState.SEEN, EdgeState.SEEN), pixels, bearings),
+        section=SectionEdges((EdgeState.SEEN, EdgeState.SEEN), bearings, pixels=pixels),
     )
     with BagWriter(path) as bag:
         for name, msgtype in TOPICS.items():

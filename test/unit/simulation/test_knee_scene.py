@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from knee_gap_core.values.edges import EdgeKind
 from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.knee.ground_truth import EdgeKind, Visibility
+from knee_gap_simulation.knee.ground_truth import Visibility
 from knee_gap_simulation.knee.scene import NEAREST_WITHIN, KneeScene
 from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.surfaces.distance_field import CONDYLE, MENISCUS, PLATEAU

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from travelling_scope import TINY, travelling
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.acceptance import RULES, Facts, Kept, Reason, judge
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -72,7 +73,8 @@ def test_counts_stay_bounded_whatever_is_wrong_with_edges_and_poses() -> None:
             bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         covariances = bearing_covariances(bearings, rng.choice([1e-3, 10.0]))
         bound = rng.choice([-1.0, 1e-6, 0.1, 9.0])
-        edges = EdgeObservation(stamp, 1, rng.random() < 0.9, bearings, covariances, bound, status=k % 256)
+        status = EdgeStatus.VALID if rng.random() < 0.9 else EdgeStatus(k % len(EdgeStatus))
+        edges = replace(GapEdges.of_points(stamp, 1, bearings, covariances, bound), status=status)
         place = 1e-4 * rng.standard_normal(3)
         quaternion = Rotation.random(random_state=k).as_quat()
         estimator.add_pose(LensPose(stamp, "world", place, quaternion, np.diag([1e-12] * 6)), stamp)

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -39,7 +40,7 @@ class Scope:
     tremor: float = 0.1e-3
     shift: Callable[[float], Array] = lambda t: np.zeros((2, 3))
     pose_reported: Callable[[LensPose, float], LensPose] = lambda pose, t: pose
-    edges_reported: Callable[[EdgeObservation, float], EdgeObservation] = lambda edges, t: edges
+    edges_reported: Callable[[GapEdges, float], GapEdges] = lambda edges, t: edges
     late: float = 0.0
     seen: Callable[[float], bool] = lambda t: True
     along: Array = field(init=False)
@@ -91,7 +92,7 @@ class Scope:
         turned = Rotation.from_rotvec(ROTATION_ERROR / np.sqrt(3) * self.rng.standard_normal(3))
         return LensPose(SECOND + round(t * 1e9), "world", position, turned.as_quat(), np.zeros((6, 6)))
 
-    def edges(self, t: float) -> EdgeObservation:
+    def edges(self, t: float) -> GapEdges:
         """What the camera says."""
         position, rotation = self.place(t)
         towards = rotation.inv().apply(self.points(t) - position)
@@ -101,8 +102,8 @@ class Scope:
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
         covariances = SIGMA**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
         return self.edges_reported(
-            EdgeObservation(
-                SECOND + round(t * 1e9), 1, True, bearings, covariances, angular_error=3.0 * SIGMA
+            GapEdges.of_points(
+                SECOND + round(t * 1e9), 1, bearings, covariances, angular_error=3.0 * SIGMA
             ).with_rims_at_points(),
             t,
         )
@@ -171,7 +172,7 @@ def test_pose_that_freezes_while_the_scope_goes_on(scope: Scope) -> None:
 
 
 def test_points_that_change_places(scope: Scope) -> None:
-    def swapped(edges: EdgeObservation, t: float) -> EdgeObservation:
+    def swapped(edges: GapEdges, t: float) -> GapEdges:
         return replace(edges, bearings=edges.bearings[::-1].copy()) if t > 1.5 else edges
 
     scope.edges_reported = swapped
@@ -232,7 +233,7 @@ def test_point_that_slips_along_its_ray_is_told_by_the_leg_body_only() -> None:
 
 
 def test_edge_that_is_wrong_from_the_start(scope: Scope) -> None:
-    def wrong(edges: EdgeObservation, t: float) -> EdgeObservation:
+    def wrong(edges: GapEdges, t: float) -> GapEdges:
         if t > 0.2:
             return edges
         bearings = edges.bearings.copy()
@@ -269,7 +270,7 @@ def test_images_that_come_twice_change_nothing() -> None:
     scope, estimator = Scope(np.random.default_rng(3)), GapEstimator(EXACT)
     add_edges = estimator.add_edges
 
-    def twice(edges: EdgeObservation, arrival_ns: int) -> list[GapEstimate]:
+    def twice(edges: GapEdges, arrival_ns: int) -> list[GapEstimate]:
         return add_edges(edges, arrival_ns) + add_edges(edges, arrival_ns)
 
     estimator.add_edges = twice  # type: ignore[method-assign]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.errors import MeasurementError
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -37,13 +38,14 @@ def pose(stamp_ns: int, x: float, frame_id: str = "world") -> LensPose:
     )
 
 
-def edges(stamp_ns: int, x: float, track_id: int = 1, usable: bool = True) -> EdgeObservation:
+def edges(stamp_ns: int, x: float, track_id: int = 1, usable: bool = True) -> GapEdges:
     towards = TILT.inv().apply(POINTS - [x, 0.0, 0.0])
     bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     sigma = np.radians(0.1)
     covariances = sigma**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
-    seen = EdgeObservation(stamp_ns, track_id, usable, bearings, covariances, angular_error=np.radians(0.3))
-    return seen.with_rims_at_points()
+    seen = GapEdges.of_points(stamp_ns, track_id, bearings, covariances, angular_error=np.radians(0.3))
+    status = EdgeStatus.VALID if usable else EdgeStatus.UNKNOWN
+    return replace(seen.with_rims_at_points(), status=status)
 
 
 def run(

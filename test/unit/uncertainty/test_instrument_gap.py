@@ -5,12 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vectors import unit
 
+from knee_gap_core.values.edges import EdgeKind
 from knee_gap_uncertainty.instrument_gap.gap_kernels import side, widest
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     CONE,
     CONTOUR_SHAPES,
-    KIND_CONTOUR,
-    KIND_RIM,
     TILTS,
     Edges,
     bounds_of_gap,
@@ -142,7 +141,7 @@ def test_two_flat_faces_that_end_in_rims_leave_what_lies_between_the_rims():
 def test_the_gap_moves_with_the_scene_and_grows_with_its_scale(seed):
     rng = np.random.default_rng(seed)
     scene = some_cylinders(rng)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_RIM))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.RIM))
     turn, shift = Rotation.random(random_state=seed), rng.uniform(-1.0, 1.0, 3)
     there = widest_gap(scene.points, LENS, opening_of(bearings(scene.points), scene.edges), edges)
     turned = turn.apply(scene.edges)
@@ -152,7 +151,7 @@ def test_the_gap_moves_with_the_scene_and_grows_with_its_scale(seed):
         there, rel=1e-9
     )
     # Rims have no length of their own.
-    rims = edges._replace(kinds=(KIND_RIM, KIND_RIM))
+    rims = edges._replace(kinds=(EdgeKind.RIM, EdgeKind.RIM))
     opening = opening_of(bearings(scene.points), scene.edges)
     once, twice = (widest_gap(k * scene.points, LENS, opening, rims) for k in (1.0, 2.0))
     assert twice == pytest.approx(2.0 * once, rel=1e-9)
@@ -161,7 +160,7 @@ def test_the_gap_moves_with_the_scene_and_grows_with_its_scale(seed):
 def test_an_opening_that_is_wider_with_the_same_sides_leaves_more_room():
     scene = some_cylinders(np.random.default_rng(5))
     opening = opening_of(bearings(scene.points), scene.edges)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_CONTOUR))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.CONTOUR))
     gaps = []
     for more in np.radians([0.0, 0.3, 0.6]):
         wider = opening._replace(half=opening.half + more)
@@ -201,7 +200,7 @@ def test_bounds_hold_whatever_the_admitted_errors(seed):
         present,
         first,
         opening,
-        Edges(edges, np.full(2, edge_error / 3.0), edge_error, (KIND_CONTOUR, KIND_CONTOUR)),
+        Edges(edges, np.full(2, edge_error / 3.0), edge_error, (EdgeKind.CONTOUR, EdgeKind.CONTOUR)),
         psi,
         theta,
         displacements(shift, 1),
@@ -211,7 +210,14 @@ def test_bounds_hold_whatever_the_admitted_errors(seed):
     assert lower > 0.0
 
 
-@pytest.mark.parametrize("kinds", [(KIND_CONTOUR, KIND_CONTOUR), (KIND_RIM, KIND_RIM), (0, 0)])
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        (EdgeKind.CONTOUR, EdgeKind.CONTOUR),
+        (EdgeKind.RIM, EdgeKind.RIM),
+        (EdgeKind.UNKNOWN, EdgeKind.UNKNOWN),
+    ],
+)
 def test_the_interval_encloses_the_gap_and_grows_with_each_error(kinds):
     scene = some_cylinders(np.random.default_rng(3))
     opening = opening_of(bearings(scene.points), scene.edges)
@@ -231,7 +237,7 @@ def test_the_interval_encloses_the_gap_and_grows_with_each_error(kinds):
 def test_points_whose_depth_has_no_bound_leave_the_upper_end_infinite():
     scene = some_cylinders(np.random.default_rng(3))
     opening = opening_of(bearings(scene.points), scene.edges)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_RIM))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.RIM))
     found = instrument_gap(fit_of(scene.points, 1e-4 * np.eye(6)), LENS, opening, edges, 1.96)
     assert found.upper == np.inf
     assert np.isfinite(found.lower)
@@ -240,7 +246,7 @@ def test_points_whose_depth_has_no_bound_leave_the_upper_end_infinite():
 def test_the_axis_leads_away_from_the_lens_within_the_cone():
     scene = some_cylinders(np.random.default_rng(8))
     opening = opening_of(bearings(scene.points), scene.edges)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_RIM))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.RIM))
     found = instrument_gap(fit_of(scene.points, np.zeros((6, 6))), LENS, opening, edges, 1.96)
     assert np.linalg.norm(found.axis) == pytest.approx(1.0)
     assert found.axis @ opening.view >= np.cos(CONE) - 1e-12
@@ -249,7 +255,7 @@ def test_the_axis_leads_away_from_the_lens_within_the_cone():
 def test_the_edge_of_a_cylinder_lies_about_where_its_tangent_touches():
     scene = TwoCylinders([(-0.021, 0.012), (0.021, 0.012)], (0.018, 0.018))
     opening = opening_of(bearings(scene.points), scene.edges)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_CONTOUR))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.CONTOUR))
     found = edge_points(LENS, scene.points, opening, edges)
     assert np.linalg.norm(found - scene.contacts, axis=1).max() < 0.6e-3
 
@@ -281,7 +287,9 @@ def test_least_and_greatest_gap_are_so_for_any_error_within_the_bounds(inset):
     opening = opening_of(bearings(some_cylinders(rng).points), some_cylinders(rng).edges)
     opening = opening._replace(half=0.3, insets=np.full(2, inset), in_plane=np.ones(2))
     ranges, edge_error, image_error = np.array([0.015, 0.013]), 0.011, 0.001
-    edges = Edges(np.zeros((2, 3)), np.full(2, edge_error / 3.0), edge_error, (KIND_CONTOUR, KIND_CONTOUR))
+    edges = Edges(
+        np.zeros((2, 3)), np.full(2, edge_error / 3.0), edge_error, (EdgeKind.CONTOUR, EdgeKind.CONTOUR)
+    )
     lower, upper = bounds_of_gap(ranges, ranges, opening, edges, image_error)
     for _ in range(300):
         wrong = edge_error * rng.uniform(-1.0, 1.0, 2)
@@ -298,7 +306,7 @@ def test_least_and_greatest_gap_are_so_for_any_error_within_the_bounds(inset):
 def test_the_axis_passes_midway_between_what_it_touches():
     scene = TwoCylinders([(-0.021, 0.012), (0.021, 0.019)], (0.018, 0.018))
     opening = opening_of(bearings(scene.points), scene.edges)
-    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (KIND_CONTOUR, KIND_CONTOUR))
+    edges = Edges(scene.edges, np.full(2, 1e-3), 3e-3, (EdgeKind.CONTOUR, EdgeKind.CONTOUR))
     found = instrument_gap(fit_of(scene.points, np.zeros((6, 6))), LENS, opening, edges, 1.96)
     away = [
         np.linalg.norm(np.cross(found.axis, np.array([0.0, *centre]) - found.point)) - radius

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -62,7 +63,7 @@ def observe(
                 bearings = bearings + jumps[k] + noise * SIGMA * rng.standard_normal((2, 3))
                 bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
                 outer = bearings[:, :, None] * bearings[:, None, :]
-                edges = EdgeObservation(stamp, 1, True, bearings, SIGMA**2 * (np.eye(3) - outer), BOUND)
+                edges = GapEdges.of_points(stamp, 1, bearings, SIGMA**2 * (np.eye(3) - outer), BOUND)
                 estimates += estimator.add_edges(edges.with_rims_at_points(), stamp)
     return estimates
 

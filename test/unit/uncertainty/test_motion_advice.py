@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from knee_gap_core.values.edges import EdgeKind
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
-    KIND_RIM,
     Edges,
     opening_of,
     widest_gap,
@@ -66,7 +66,7 @@ def situation(
         apex="best",
         confidence_level=0.95,
         views=views,
-        edges=Edges(unit(EDGES - lens[-1]), np.full(2, 1e-3), 3e-3, (KIND_RIM, KIND_RIM)),
+        edges=Edges(unit(EDGES - lens[-1]), np.full(2, 1e-3), 3e-3, (EdgeKind.RIM, EdgeKind.RIM)),
     )
 
 

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from travelling_scope import NOTHING, camera_errors, estimates, reported, scope, spread
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate, GapStatus
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -173,7 +174,7 @@ def test_another_error_under_the_same_hash_begins_a_new_track() -> None:
         place = views.lens_positions[0] + [1e-3 * k, 0.0, 0.0]
         quaternion, covariance = Rotation.from_matrix(rotation).as_quat(), np.diag([1e-10] * 3 + [1e-9] * 3)
         estimator.add_pose(LensPose(stamp_ns, "world", place, quaternion, covariance), stamp_ns)
-        edges = EdgeObservation(stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), 6e-3)
+        edges = GapEdges.of_points(stamp_ns, 1, bearings, bearing_covariances(bearings, 2e-3), 6e-3)
         counts += [one.baseline for one in estimator.add_edges(edges, stamp_ns)]
     assert counts == pytest.approx([0.0, 1e-3, 0.0])
 

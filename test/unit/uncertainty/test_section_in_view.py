@@ -1,10 +1,12 @@
 """The edges at the section, carried on while no image shows them; and the profile along the opening."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from vectors import unit
 
-from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
+from knee_gap_core.values.edges import EdgeKind, EdgeState, GapEdges, SectionEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.instrument_gap.gap_profile import gap_profile
 from knee_gap_uncertainty.instrument_gap.instrument_gap import Edges, opening_of
@@ -16,19 +18,18 @@ EDGES = np.array([[0.0, -0.002, 0.0125], [0.0, 0.002, 0.0125]])
 SEEN = (EdgeState.SEEN, EdgeState.SEEN)
 
 
-def at(seconds, place=(0.0, 0.0, 0.0), states=SEEN, **changes) -> tuple[EdgeObservation, PosedView]:
+def at(seconds, place=(0.0, 0.0, 0.0), states=SEEN, **changes) -> tuple[GapEdges, PosedView]:
     """Observation and view of the points and edges from a lens at a place."""
     stamp_ns = int(1e9 * seconds)
     towards = unit(POINTS - place)
     outer = towards[..., :, None] * towards[..., None, :]
-    section = EdgeSection(states, unit(EDGES - place), np.full(2, 1e-3), 3e-3)
+    section = SectionEdges(states, unit(EDGES - place), np.full(2, 1e-3), 3e-3)
     if EdgeState.UNKNOWN in states:
-        section = EdgeSection(states)
+        section = SectionEdges(states)
     if changes:
-        section = EdgeSection(**{**section.__dict__, **changes})
-    edges = EdgeObservation(
-        stamp_ns, 1, True, towards, 1e-6 * (np.eye(3) - outer), 4e-3, kinds=(2, 1), section=section
-    )
+        section = SectionEdges(**{**section.__dict__, **changes})
+    edges = GapEdges.of_points(stamp_ns, 1, towards, 1e-6 * (np.eye(3) - outer), 4e-3)
+    edges = replace(edges, kinds=(EdgeKind.CONTOUR, EdgeKind.RIM), section=section)
     pose = LensPose(stamp_ns, "world", np.array(place), np.array([0.0, 0.0, 0.0, 1.0]), 1e-12 * np.eye(6))
     return edges, posed_view(edges, pose, 3.0, 0.0)
 
@@ -95,7 +96,7 @@ def profile(widths):
     for k, width in enumerate(widths):
         x = 1e-3 * (k - len(widths) // 2)
         bearings = unit(np.array([[x, -width, 0.012], [x, width, 0.012]]))
-        sections.append(EdgeSection(SEEN, bearings, np.full(2, 1e-3), 3e-3))
+        sections.append(SectionEdges(SEEN, bearings, np.full(2, 1e-3), 3e-3))
     edges = Edges(sections[len(widths) // 2].bearings, np.full(2, 1e-3), 3e-3, (1, 1))
     points = unit(POINTS)
     opening = opening_of(points, edges.bearings)

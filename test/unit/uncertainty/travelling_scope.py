@@ -1,10 +1,13 @@
 """A scope that travels, for tests of the errors that all its views share."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -81,9 +84,7 @@ def camera_errors(views: Views, *columns: int) -> Array:
     return np.asarray(np.einsum("nij,nkjc->nkic", rotations, moved[..., list(columns)]))
 
 
-def observed(
-    views: Views, k: int, stamp_ns: int, errors: Array = NO_ERRORS
-) -> tuple[EdgeObservation, LensPose]:
+def observed(views: Views, k: int, stamp_ns: int, errors: Array = NO_ERRORS) -> tuple[GapEdges, LensPose]:
     """One of the views as the estimator is told of it: the edges in an image, and the pose of the lens.
 
     `errors` (2, 3, n) are what the camera's own errors do to the bearings, in the frame of the views.
@@ -91,10 +92,10 @@ def observed(
     assert views.lens_rotations is not None
     rotation = views.lens_rotations[k]
     bearings = views.bearings[k] @ rotation
-    edges = EdgeObservation(
-        stamp_ns, 1, True, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3,
+    edges = replace(
+        GapEdges.of_points(stamp_ns, 1, bearings, bearing_covariances(bearings, 2e-3), angular_error=6e-3),
         camera_errors=np.einsum("ij,kic->kjc", rotation, errors),
-    ).with_rims_at_points()  # fmt: skip
+    ).with_rims_at_points()
     quaternion = Rotation.from_matrix(rotation).as_quat()
     covariance = np.diag([1e-10] * 3 + [1e-9] * 3)
     return edges, LensPose(stamp_ns, "world", views.lens_positions[k], quaternion, covariance)
@@ -142,7 +143,7 @@ def travelling(
         pose = LensPose(stamp, "world", place, Rotation.identity().as_quat(), np.diag([1e-16] * 6))
         bearings = points - place
         bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-        edges = EdgeObservation(stamp, 1, True, bearings, bearing_covariances(bearings, sigma), 3.0 * sigma)
+        edges = GapEdges.of_points(stamp, 1, bearings, bearing_covariances(bearings, sigma), 3.0 * sigma)
         estimator.add_pose(pose, stamp)
         found += estimator.add_edges(edges.with_rims_at_points(), stamp)
     return found

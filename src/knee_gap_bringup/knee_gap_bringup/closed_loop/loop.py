@@ -12,7 +12,8 @@ from knee_gap_bringup.closed_loop.leg import LegMechanics, SimulatedLeg
 from knee_gap_bringup.closed_loop.views import OpeningKnee
 from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegControl, LegParameters, hold
 from knee_gap_core.bag.message_types import blank
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_simulation.knee_views import ViewErrors
@@ -111,8 +112,8 @@ class ClosedLoop:
         self._rng = rng
         self._estimator: GapEstimator | None = None
         self._message = blank("knee_gap_msgs/msg/GapEstimate")
-        self._images: deque[tuple[int, EdgeObservation, LensPose]] = deque()
-        self._last: tuple[EdgeObservation, LensPose] | None = None
+        self._images: deque[tuple[int, GapEdges, LensPose]] = deque()
+        self._last: tuple[GapEdges, LensPose] | None = None
         self._held_back: list[GapEstimate] = []
         self._overtaken: GapEstimate | None = None
         self._fault_since = float("nan")

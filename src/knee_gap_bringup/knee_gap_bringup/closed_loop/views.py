@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation
+from knee_gap_core.values.edges import LENS_FRAME, EdgeStatus, GapEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.scene import KneeScene
@@ -13,8 +13,6 @@ from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.knee_views import ViewDrawer, ViewErrors, edges_seen, points_beside
 from knee_gap_simulation.recordings.section_truth import true_instrument_gap
 
-# Status of edges without a gap, of knee_gap_msgs/GapEdges.
-_NO_GAP = 2
 # Longest part of the hand's motion in which the scope is kept clear of the tissue [s].
 _CLEAR_FOR = 8.0
 
@@ -57,7 +55,7 @@ class OpeningKnee:
         """End the track: the next image chooses its points anew."""
         self._section = None
 
-    def observe(self, stamp_ns: int, time: float, opening: float) -> tuple[EdgeObservation, LensPose]:
+    def observe(self, stamp_ns: int, time: float, opening: float) -> tuple[GapEdges, LensPose]:
         """Edges and lens pose of an image at a time, with the joint opened so far."""
         T_scene_lens = self._simulator.pose(time)
         pose = self._drawer.lens_pose(stamp_ns, T_scene_lens)
@@ -66,11 +64,7 @@ class OpeningKnee:
         if section is None or not np.isfinite(edges).all():
             # The points are out of view, or were never found: a new track begins with the next image.
             self._section = None
-            nothing = np.full((2, 3), np.nan)
-            lost = EdgeObservation(
-                stamp_ns, 0, False, nothing, np.full((2, 3, 3), np.nan), float("nan"), status=_NO_GAP
-            )
-            return lost, pose
+            return GapEdges.without_points(stamp_ns, LENS_FRAME, EdgeStatus.NO_GAP), pose
         self._seen[stamp_ns] = _Seen(T_scene_lens, edges, opening)
         # The upper point is on the condyle and moves with it.
         points = section.points - [[0.0, opening - section.opening, 0.0], [0.0, 0.0, 0.0]]

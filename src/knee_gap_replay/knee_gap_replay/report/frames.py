@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,9 +11,9 @@ import numpy as np
 from knee_gap_core.bag.bag import BagMessage, BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.values.arrays import Array, Image
-from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
+from knee_gap_core.values.edge_messages import edges_from_message
+from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
-from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.edge_tracking.overlay import draw_overlay
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages import image_from_compressed, image_from_message
@@ -80,7 +80,7 @@ def _edges(bag: BagReader, topic: str, stamps: Collection[int]) -> dict[int, Gap
     for entry in bag.messages([topic]):
         stamp = bag.stamp_ns(entry)
         if stamp is not None and stamp in stamps:
-            found[stamp] = edges_of(bag.deserialize(entry))
+            found[stamp] = edges_from_message(bag.deserialize(entry))
     return found
 
 
@@ -117,32 +117,3 @@ def _jpeg(image: Image) -> bytes:
     scale = min(1.0, _WIDTH / image.shape[1])
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-
-
-def edges_of(message: Any) -> GapEdges:
-    """What is drawn of a knee_gap_msgs/GapEdges."""
-
-    def known(kind: Any, value: int) -> Any:
-        return kind(value) if value in kind.__members__.values() else kind(0)
-
-    def vectors(name: str) -> Any:
-        return np.array([[v.x, v.y, v.z] for v in (getattr(message, f"{name}_{i}") for i in (0, 1))])
-
-    return GapEdges(
-        stamp_ns=stamp_ns(message.header),
-        frame_id=str(message.header.frame_id),
-        status=known(EdgeStatus, int(message.status)),
-        track_id=int(message.track_id),
-        bearings=vectors("bearing"),
-        pixels=np.array([message.pixel_0, message.pixel_1], dtype=float),
-        kinds=(known(EdgeKind, int(message.kind_0)), known(EdgeKind, int(message.kind_1))),
-        covariances=np.array([message.covariance_0, message.covariance_1], dtype=float).reshape(2, 3, 3),
-        angular_error=float(message.angular_error),
-        hidden=(bool(message.hidden_0), bool(message.hidden_1)),
-        section=SectionEdges(
-            states=(known(EdgeState, int(message.edge_state_0)), known(EdgeState, int(message.edge_state_1))),
-            pixels=np.array([message.edge_pixel_0, message.edge_pixel_1], dtype=float),
-            bearings=vectors("edge"),
-            error=float(message.edge_error),
-        ),
-    )

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.bag.qos import QosName
 from knee_gap_core.node.seam import Fault, Seam
+from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_replay.processing import Output
@@ -88,7 +89,7 @@ class EstimationStage:
         return self.estimator.add_pose(messages.pose_from_message(request.message), request.now_ns)
 
     def _on_edges(self, request: Request) -> list[GapEstimate]:
-        return self.estimator.add_edges(messages.edges_from_message(request.message), request.now_ns)
+        return self.estimator.add_edges(edges_from_message(request.message), request.now_ns)
 
     def _published(self, estimates: Iterable[GapEstimate]) -> Iterator[Output]:
         for estimate in estimates:

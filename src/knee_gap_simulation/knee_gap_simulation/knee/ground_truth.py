@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.edges import EdgeKind
 from knee_gap_core.values.rigid_transforms import inverse
 from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.scope.lens import Lens
@@ -28,15 +29,6 @@ class Visibility(IntEnum):
     BEHIND_TISSUE = 2
     BEHIND_PROBE = 3
     BEHIND_DEBRIS = 4
-
-
-class EdgeKind(IntEnum):
-    """Kind of the nearest edge of the gap, with the values of knee_gap_msgs/GapEdges."""
-
-    UNKNOWN = 0
-    RIM = 1
-    CONTOUR = 2
-    SHADING = 3
 
 
 class SurfacePoints(NamedTuple):

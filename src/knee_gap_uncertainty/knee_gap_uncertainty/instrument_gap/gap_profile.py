@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeSection
+from knee_gap_core.values.edges import SectionEdges
 from knee_gap_uncertainty.instrument_gap.gap_kernels import greatest_gap, least_gap, widest
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     ROUGHNESS_BOUND,
@@ -55,7 +55,7 @@ def gap_profile(
     stamp_ns: int,
     frame_id: str,
     track_id: int,
-    sections: Sequence[EdgeSection],
+    sections: Sequence[SectionEdges],
     rotation: Array,
     ranges: Array,
     near_far: tuple[Array, Array],

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.edges import EdgeKind
 from knee_gap_uncertainty.instrument_gap.gap_kernels import (
     TINY,
     edge_slopes,
@@ -44,9 +45,7 @@ TILTS = np.linspace(-CONE, CONE, 21)
 CONTOUR_SHAPES = np.array([[radius, 1.0] for radius in (0.008, 0.012, 0.016, 0.020, 0.025, 0.030)])
 RIM_SHAPES = np.array([[0.0, np.tan(np.radians(slope))] for slope in (25.0, 35.0, 45.0, 60.0, 80.0)])
 ALL_SHAPES = np.concatenate([CONTOUR_SHAPES, RIM_SHAPES])
-# By the kind of edge in knee_gap_msgs/GapEdges.
-KIND_RIM, KIND_CONTOUR = 1, 2
-SHAPES = {KIND_RIM: RIM_SHAPES, KIND_CONTOUR: CONTOUR_SHAPES}
+SHAPES = {EdgeKind.RIM: RIM_SHAPES, EdgeKind.CONTOUR: CONTOUR_SHAPES}
 
 # How far [m] a real surface departs from these shapes: ripples, frayed rims, a point beside the section.
 ROUGHNESS = 0.08e-3
@@ -62,14 +61,14 @@ LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad
 class Edges(NamedTuple):
     """Both edges in the frame of the points: bearings (2, 3), deviations (2,) and bound of the error [rad].
 
-    `kinds` (2,) are those of knee_gap_msgs/GapEdges. `bounded` is false where an edge lies in the given
+    `kinds` (2,) are those of the edges. `bounded` is false where an edge lies in the given
     direction or farther out.
     """
 
     bearings: Array
     deviations: Array
     error: float
-    kinds: tuple[int, int]
+    kinds: tuple[EdgeKind, EdgeKind]
     bounded: bool = True
 
     @property
@@ -109,8 +108,8 @@ class InstrumentGap:
     shares: Array
 
 
-def admitted_shapes(kind: int) -> Array:
-    """Shapes (n, 2) that the tissue beside an edge of a kind (of knee_gap_msgs/GapEdges) may have."""
+def admitted_shapes(kind: EdgeKind) -> Array:
+    """Shapes (n, 2) that the tissue beside an edge of a kind may have."""
     return np.asarray(SHAPES.get(kind, ALL_SHAPES))
 
 

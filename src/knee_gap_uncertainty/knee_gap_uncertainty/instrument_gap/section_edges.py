@@ -3,7 +3,7 @@
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, EdgeSection, EdgeState
+from knee_gap_core.values.edges import EdgeState, GapEdges, SectionEdges
 from knee_gap_uncertainty.instrument_gap.instrument_gap import Edges, opening_of
 from knee_gap_uncertainty.scope_calibration.posed_view import PosedView
 
@@ -31,7 +31,7 @@ class SectionInView:
         self._error = self._image_error = float("nan")
         self._deviations = np.zeros(2)
 
-    def at(self, observation: EdgeObservation, view: PosedView, distance: float) -> Edges | str:
+    def at(self, observation: GapEdges, view: PosedView, distance: float) -> Edges | str:
         """The edges at a view, whose nearer point lies at a `distance` [m]; or why there are none.
 
         Edges at the border of the picture are returned with `bounded` false: the opening is wider than them.
@@ -53,7 +53,7 @@ class SectionInView:
             self._image_error = observation.angular_error
         return edges
 
-    def _carried(self, observation: EdgeObservation, view: PosedView, distance: float) -> Edges | str:
+    def _carried(self, observation: GapEdges, view: PosedView, distance: float) -> Edges | str:
         """The edges where they were against their points when they were last seen, with a larger error."""
         if self._insets is None:
             return NOT_YET
@@ -80,7 +80,7 @@ class SectionInView:
         )
 
 
-def _is_usable(section: EdgeSection) -> bool:
+def _is_usable(section: SectionEdges) -> bool:
     """Whether the numbers of edges that are seen are finite and in range."""
     numbers = (section.bearings, section.deviations, section.error)
     if not all(np.isfinite(values).all() for values in numbers):

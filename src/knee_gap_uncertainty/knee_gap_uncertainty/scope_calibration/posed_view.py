@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from knee_gap_core.values.gap_estimate import EdgeObservation
+from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.multi_view.views import Views
 
@@ -28,9 +28,7 @@ class PosedView(NamedTuple):
     view: Views
 
 
-def posed_view(
-    edges: EdgeObservation, pose: LensPose, tracker_bound: float, camera_error: float = 0.0
-) -> PosedView:
+def posed_view(edges: GapEdges, pose: LensPose, tracker_bound: float, camera_error: float = 0.0) -> PosedView:
     """View of `edges` from `pose`; tracked errors are bounded by `tracker_bound` times their RMS length.
 
     `camera_error` [-] is the relative standard error of a focal length that was not calibrated; it comes to
@@ -62,7 +60,7 @@ def posed_view(
     )
 
 
-def _camera_errors(edges: EdgeObservation, camera_error: float) -> Floats:
+def _camera_errors(edges: GapEdges, camera_error: float) -> Floats:
     """(2, 3, k) what the edges state, and the displacement by a focal length that is wrong by a share.
 
     A bearing at an angle from the axis of the picture goes away from it by that share of the angle.

@@ -4,7 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.gap_estimate import EdgeObservation, GapEstimate
+from knee_gap_core.values.edges import GapEdges
+from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
@@ -116,8 +117,6 @@ def wrong_scope(
                 bearings = hand.bearings(time, points) + np.column_stack([noise, np.zeros(2)])
                 bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
                 covariances = bearing_covariances(bearings, SIGMA)
-                edges = EdgeObservation(
-                    stamp, 1, True, bearings, covariances, 3.0 * SIGMA
-                ).with_rims_at_points()
+                edges = GapEdges.of_points(stamp, 1, bearings, covariances, 3.0 * SIGMA).with_rims_at_points()
                 found += estimator.add_edges(edges, stamp)
     return found
