@@ -198,6 +198,7 @@ class Recorder:
         # Nothing is estimated, and so nothing advised and no profile made.
         self.advice: deque[Any] = deque()
         self.profiles: deque[Any] = deque()
+        self.calibration_flaw = ""
 
     def __getattr__(self, name: str) -> Callable[..., list[Any]]:
         def call(*arguments: Any) -> list[Any]:
@@ -227,7 +228,7 @@ def measured(recording: Recording, fault: Fault, file: ParametersFile) -> Outcom
     topics = InputTopics(IMAGE, CAMERA_INFO, BODY_POSE)
     pipeline = GapPipeline.from_parameters(file, topics, SPACE)
     recorder = Recorder(file.build("uncertainty_node", [EstimatorParameters])[0])
-    pipeline.estimation.estimator = recorder  # type: ignore[assignment]
+    pipeline.uncertainty.estimator = recorder  # type: ignore[assignment]
     edges: dict[int, SeenEdges] = {}
     for topic, message, stamp in recording.with_fault(fault):
         _note_edges(pipeline.feed(topic, message, stamp), edges)

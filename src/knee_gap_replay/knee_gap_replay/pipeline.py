@@ -1,69 +1,59 @@
 """The cores of the three live nodes in one pipeline: images, camera and body poses in, gap estimates out.
 
-The cores exchange messages, as the nodes do.
+The cores exchange the messages that the nodes exchange, by the topics that they declare.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any, Self
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, NamedTuple, Self
 
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.bag.qos import QosName
 from knee_gap_core.node.parameters_file import ParametersFile
 from knee_gap_core.node.seam import Fault, Seam
-from knee_gap_core.values.edge_messages import fill_gap_edges
-from knee_gap_core.values.edges import GapEdges
-from knee_gap_core.values.poses import LensPose
-from knee_gap_core.values.stamps import set_stamp
-from knee_gap_perception.calibration.in_use import CalibrationParameters
-from knee_gap_perception.camera.medium import Medium
-from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
-from knee_gap_perception.edge_tracking.parameters import CameraInfoParameters, PoseParameters
+from knee_gap_core.node.wiring import InputTopic, Outcome, Output, OutputTopic
+from knee_gap_perception.edge_tracking import segmentation_core
+from knee_gap_perception.edge_tracking.segmentation_core import SegmentationCore
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
-from knee_gap_perception.messages_tracking import (
-    fill_lens_pose,
-    fill_scope_calibration,
-    fill_scope_notch,
-    fill_scope_rotation,
-    notch_from_message,
-)
-from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
-from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
-from knee_gap_perception.trackers.body_source import choose_body
-from knee_gap_perception.trackers.natnet.client import NatNetParameters
-from knee_gap_perception.trackers.pose_topic import PoseTopics
-from knee_gap_perception.trackers.scope_feed import SCOPE, SourceParameters
-from knee_gap_replay.processing import Output
-from knee_gap_replay.stages.estimation import EstimationStage, Request, log_fault
+from knee_gap_perception.scope_pose import tracking_core
+from knee_gap_perception.scope_pose.tracking_core import TrackingCore
+from knee_gap_perception.trackers.scope_feed import SCOPE_TOPIC, SourceParameters
 from knee_gap_replay.topics import InputTopics
+from knee_gap_uncertainty import uncertainty_core
 from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
+from knee_gap_uncertainty.uncertainty_core import UncertaintyCore
+
+_LOG = logging.getLogger(__name__)
 
 # The parameters of each node's core.
 PARAMETERS: dict[str, tuple[type, ...]] = {
-    "segmentation_node": (EdgeParameters, PoseParameters, CalibrationParameters, CameraInfoParameters),
-    "tracking_node": (
-        TrackingParameters,
-        ValidityParameters,
-        CalibrationParameters,
-        SourceParameters,
-        NatNetParameters,
-    ),
-    "uncertainty_node": (EstimatorParameters, AdviceParameters),
+    segmentation_core.NODE: SegmentationCore.parameters,
+    tracking_core.NODE: TrackingCore.parameters,
+    uncertainty_core.NODE: UncertaintyCore.parameters,
 }
+
+
+class Request(NamedTuple):
+    """A call of the second stage: `call` is a method of its core, `topic` and `message` are what it takes.
+
+    `what` stands in the report of an exception; `now_ns` is the time by the stamps.
+    """
+
+    call: str
+    topic: str
+    what: str
+    message: Any
+    now_ns: int
 
 
 class GapPipeline:
     """Feeds the cores in the order of stamps; `space` is the namespace of the published topics.
 
-    `with_mask` publishes the gap mask of every image as well; the node does so only if there are subscribers.
+    Its first stage is segmentation and tracking, its second the estimation, from which the first needs
+    nothing back. `with_mask` publishes the gap mask of every image as well; the node does so only if there
+    are subscribers.
     """
 
     @classmethod
@@ -76,107 +66,58 @@ class GapPipeline:
         """
         file.refuse_unknown(PARAMETERS)
         built = {node: file.build(node, kinds) for node, kinds in PARAMETERS.items()}
-        edges, poses, calibration_of_camera, camera_info = built["segmentation_node"]
-        tracking, validity, calibration_of_lens, source, _ = built["tracking_node"]
-        if calibration_of_camera.scope_rotation_notch != calibration_of_lens.scope_rotation_notch:
+        _, _, of_camera, _ = built[segmentation_core.NODE]
+        tracking, validity, of_lens, source, natnet = built[tracking_core.NODE]
+        if of_camera.scope_rotation_notch != of_lens.scope_rotation_notch:
             raise BagError("scope_rotation_notch must be the same for segmentation_node and tracking_node")
-        if calibration_of_camera.used_in != calibration_of_lens.used_in:
+        if of_camera.used_in != of_lens.used_in:
             raise BagError("medium must be the same for segmentation_node and tracking_node")
+        # A bag contains topics only; poses received from Motive directly were recorded as poses of the lens.
+        of_topics = SourceParameters(source="pose", up_axis=source.resolved_up_axis())
+        of_tracking = (tracking, validity, of_lens, of_topics, natnet)
         try:
-            stream = EdgeStream(
-                edges,
-                poses,
-                calibration_of_camera.load(),
-                by_notch=calibration_of_camera.scope_rotation_notch,
-                medium=calibration_of_camera.used_in,
-                camera_info_medium=camera_info.calibrated_in,
-            )
-            tracker = ScopeTracker(
-                tracking,
-                validity,
-                calibration_of_lens.load(),
-                by_notch=calibration_of_lens.scope_rotation_notch,
-            )
+            segmentation = SegmentationCore.from_parameters(built[segmentation_core.NODE], blank)
+            tracker = TrackingCore.from_parameters(of_tracking, blank)
         except PerceptionError as error:
             raise BagError(str(error)) from None
-        return cls(
-            stream,
-            tracker,
-            GapEstimator(*built["uncertainty_node"]),
-            topics,
-            space,
-            up_axis=source.resolved_up_axis(),
-            with_mask=with_mask,
-            medium=calibration_of_lens.used_in,
-        )
+        estimator = GapEstimator(*built[uncertainty_core.NODE])
+        uncertainty = UncertaintyCore(estimator, blank)
+        return cls(segmentation, tracker, uncertainty, topics, space, with_mask=with_mask)
 
     def __init__(
         self,
-        detector: EdgeStream,
-        tracker: ScopeTracker,
-        estimator: GapEstimator,
+        segmentation: SegmentationCore,
+        tracking: TrackingCore,
+        uncertainty: UncertaintyCore,
         topics: InputTopics,
         space: str,
         *,
-        up_axis: str = "z",
         with_mask: bool = False,
-        medium: Medium | None = None,
     ) -> None:
-        self._detector = detector
-        self._tracker = tracker
-        # A bag contains topics only; poses received from Motive directly were recorded as poses of the lens.
-        self._body_names = {topics.body_pose: SCOPE}
-        for name, topic in tracker.parameters.other_bodies.items():
-            self._body_names[f"{space}/{topic}"] = name
-        self._bodies = PoseTopics([*self._body_names.values()], up_axis=up_axis)
-        self.estimation = EstimationStage(estimator, space)
-        self._topics = topics
+        self.segmentation, self.tracking, self.uncertainty = segmentation, tracking, uncertainty
         self._space = space
         self._with_mask = with_mask
-        # Calibrations that the nodes publish at their start; in a bag only if there is one.
-        used = {"segmentation_node": detector.calibration, "tracking_node": tracker.calibration}
-        self._calibrations = [
-            fill_scope_calibration(
-                blank("knee_gap_msgs/msg/ScopeCalibration"),
-                node,
-                calibration,
-                rotation_followed=node == "tracking_node" and tracker.follows_rotation,
-                medium=medium,
-            )
-            for node, calibration in used.items()
-            if any(used.values())
-        ]
+        # Names in the bag, by those of the nodes; the others lie in the namespace.
+        self._names = {
+            **{given.topic: topics.image for given in segmentation_core.IMAGES.values()},
+            segmentation_core.CAMERA_INFO.topic: topics.camera_info,
+            SCOPE_TOPIC: topics.body_pose,
+        }
         # As in the nodes: an exception rejects one message, and that core starts again.
-        self._seam = Seam(log_fault)
+        self._seam, self._second_seam = Seam(log_fault), Seam(log_fault)
         self._newest_stamp_ns: int | None = None
         # The estimator's clock: it follows the stamps, and stands still while they run backwards.
         self._now_ns = 0
-        self._leg_body = [f"{space}/leg_body/pose"] if estimator.parameters.leg_motion > 0.0 else []
-        # Among equal stamps, the camera model and the pose come before the image.
-        bodies = (*self._leg_body, *self._body_names)
-        self.inputs: Sequence[str] = (topics.camera_info, *bodies, topics.image)
+        # In a bag, calibrations are published only if there is one.
+        self._is_calibrated = any((segmentation.stream.calibration, tracking.tracker.calibration))
+        self.estimated_types = {given.topic: given.msgtype for given in uncertainty.inputs}
+        self._receivers = dict(self._received())
+        # Among equal stamps, the camera model and the poses come before the image.
+        driven = [name for name, (given, _) in self._receivers.items() if given.from_driver]
+        self.inputs: Sequence[str] = (*(name for name in driven if name != topics.image), topics.image)
         self.outputs: Mapping[str, tuple[str, QosName]] = {
-            self._topic("gap_edges"): ("knee_gap_msgs/msg/GapEdges", "reliable"),
-            self._topic("scope_pose"): ("geometry_msgs/msg/PoseWithCovarianceStamped", "reliable"),
-            **self.estimation.outputs,
+            self._name(one.topic): (one.msgtype, one.qos.in_bags) for one in self._published()
         }
-        if self._calibrations:
-            self.outputs = {
-                **self.outputs,
-                self._topic("scope_calibration"): ("knee_gap_msgs/msg/ScopeCalibration", "latched"),
-            }
-        if tracker.by_notch:
-            self.outputs = {
-                **self.outputs,
-                self._topic("scope_notch"): ("knee_gap_msgs/msg/ScopeNotch", "reliable"),
-            }
-        if tracker.follows_rotation:
-            self.outputs = {
-                **self.outputs,
-                self._topic("scope_rotation"): ("knee_gap_msgs/msg/ScopeRotation", "reliable"),
-            }
-        if with_mask:
-            self.outputs = {**self.outputs, self._topic("gap_mask"): ("sensor_msgs/msg/Image", "sensor")}
 
     def feed(self, topic: str, message: Any, stamp_ns: int) -> Iterable[Output]:
         """Process an image, a camera model or a pose of the tracked body; return the messages published."""
@@ -186,9 +127,58 @@ class GapPipeline:
         """Return the edges and estimates of images that are still waiting for their lens pose."""
         return self._both(self.observe_end())
 
+    def observe(self, topic: str, message: Any, stamp_ns: int) -> Iterator[Output | Request]:
+        """The first stage: segmentation and tracking. Its requests are for `estimate`, in this order.
+
+        It needs no answer, so that the second stage may run later or elsewhere.
+        """
+        if self._newest_stamp_ns is not None:
+            self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
+        elif self._is_calibrated:
+            for core in (self.segmentation, self.tracking):
+                yield from self._passed_on(core.begin(stamp_ns))
+        self._newest_stamp_ns = stamp_ns
+        # Before the message is processed: images whose wait is over go on without it, as live.
+        yield from self._ready()
+        yield Request("ready", "", "time", None, self._now_ns)
+        yield from self._delivered(topic, message, f"message on {topic}")
+        yield from self._ready()
+
+    def observe_end(self) -> Iterator[Output | Request]:
+        """The first stage of the images that are still waiting for their lens pose."""
+        faults = -1
+        while faults < self._seam.counts.total():
+            # Repeated if an image raised, for the images after it.
+            faults = self._seam.counts.total()
+            waiting = self.segmentation.finish(self._now_ns)
+            yield from self._passed_on(self._seam.each("image", self.segmentation.recover, waiting))
+        yield Request("finish", "", "end", None, self._now_ns)
+
     def estimate(self, request: Request) -> Iterator[Output]:
         """The second stage: answer a request of the first."""
-        return self.estimation.answer(request)
+        outcomes = self._second_seam.each(request.what, self.uncertainty.recover, self._asked(request))
+        for one in outcomes:
+            if isinstance(one, Output):
+                yield one._replace(topic=self._name(one.topic))
+
+    def flaws(self) -> list[str]:
+        """Faults, one line each: those of the calibration that make all results invalid, and exceptions."""
+        return [*self.estimation_flaws(), *self.observation_flaws()]
+
+    def observation_flaws(self) -> list[str]:
+        """Faults of the first stage."""
+        size = self.segmentation.stream.size_flaw
+        return [*([size] if size else []), *_counted(self._seam)]
+
+    def estimation_flaws(self) -> list[str]:
+        """Faults of the second stage."""
+        flaw = self.uncertainty.estimator.calibration_flaw
+        return [*([flaw] if flaw else []), *_counted(self._second_seam)]
+
+    def unread(self) -> str:
+        """Why no image could be read; empty if one was."""
+        stream = self.segmentation.stream
+        return "" if stream.images_read else stream.unread_reason or "there is none"
 
     def _both(self, observed: Iterable[Output | Request]) -> Iterator[Output]:
         for item in observed:
@@ -197,149 +187,78 @@ class GapPipeline:
             else:
                 yield from self.estimate(item)
 
-    def observe(self, topic: str, message: Any, stamp_ns: int) -> Iterator[Output | Request]:
-        """The first stage: segmentation and tracking. Its requests are for `estimate`, in this order.
+    def _ready(self) -> Iterator[Output | Request]:
+        ready = self.segmentation.ready(self._now_ns)
+        return self._passed_on(self._seam.each("image", self.segmentation.recover, ready))
 
-        It needs no answer, so that the second stage may run later or elsewhere.
-        """
-        if self._newest_stamp_ns is not None:
-            self._now_ns += max(0, stamp_ns - self._newest_stamp_ns)
+    def _asked(self, request: Request) -> Iterator[Outcome]:
+        """What the core of the second stage returns for a request."""
+        if request.call == "take":
+            yield from self.uncertainty.take(request.topic, request.message, request.now_ns)
+        elif request.call == "ready":
+            yield from self.uncertainty.ready(request.now_ns)
         else:
-            yield from self._reported_calibrations(stamp_ns)
-        self._newest_stamp_ns = stamp_ns
-        # Before the message is processed: images whose wait is over go on without it, as live.
-        yield from self._looked_at(self._detector.ready(self._now_ns))
-        yield self._request("time", "time")
-        what = f"message on {topic}"
-        if topic == self._topics.camera_info:
-            yield from self._segmented(what, lambda: self._detector.on_camera_info(message))
-        elif topic in self._leg_body:
-            yield self._request("leg_pose", what, message)
-        elif topic in self._body_names:
-            name = self._body_names[topic]
-            yield from self._on_lenses(
-                self._seam.call(what, self._restart_tracker, lambda: self._tracked(name, message))
-            )
-        else:
-            yield from self._on_image(what, message)
-        yield from self._looked_at(self._detector.ready(self._now_ns))
+            yield from self.uncertainty.finish(request.now_ns)
 
-    def flaws(self) -> list[str]:
-        """Faults, one line each: those of the calibration that make all results invalid, and exceptions."""
-        return [*self.estimation_flaws(), *self.observation_flaws()]
-
-    def observation_flaws(self) -> list[str]:
-        """Faults of the first stage."""
-        size = self._detector.size_flaw
-        return [*([size] if size else []), *_counted(self._seam)]
-
-    def estimation_flaws(self) -> list[str]:
-        """Faults of the second stage."""
-        flaw = self.estimation.estimator.calibration_flaw
-        return [*([flaw] if flaw else []), *_counted(self.estimation.seam)]
-
-    def unread(self) -> str:
-        """Why no image could be read; empty if one was."""
-        if self._detector.images_read:
-            return ""
-        return self._detector.unread_reason or "there is none"
-
-    def observe_end(self) -> Iterator[Output | Request]:
-        """The first stage of the images that are still waiting for their lens pose."""
-        faults = -1
-        while faults < self._seam.counts.total():
-            # Repeated if an image raised, for the images after it.
-            faults = self._seam.counts.total()
-            yield from self._looked_at(self._detector.finish())
-        yield self._request("end", "end")
-
-    def _reported_calibrations(self, stamp_ns: int) -> Iterator[Output | Request]:
-        for reported in self._calibrations:
-            yield self._request("calibration", "scope_calibration", reported)
-            yield Output(self._topic("scope_calibration"), reported, stamp_ns)
-
-    def _tracked(self, name: str, message: Any) -> list[LensPose | Refusal]:
-        self._bodies.put(name, message)
-        lenses: list[LensPose | Refusal] = []
-        for frame in self._bodies.poll():
-            body, others = choose_body(frame, SCOPE)
-            if body is not None:
-                lenses += self._tracker.take(body, others)
-        return lenses
-
-    def _on_image(self, what: str, message: Any) -> Iterator[Output | Request]:
-        observations: list[NotchObservation] = []
-
-        def look() -> None:
-            if (observation := self._detector.on_image(message, self._now_ns)) is not None:
-                observations.append(observation)
-
-        yield from self._segmented(what, look)
-        for observation in observations:
-            yield from self._on_notch(observation, str(message.header.frame_id))
-
-    def _on_notch(self, observation: NotchObservation, frame_id: str) -> Iterator[Output | Request]:
-        reported = fill_scope_notch(blank("knee_gap_msgs/msg/ScopeNotch"), observation, frame_id)
-        yield Output(self._topic("scope_notch"), reported, observation.stamp_ns)
-        observation = notch_from_message(reported)
-        yield from self._on_lenses(
-            self._seam.call("notch", self._restart_tracker, lambda: self._tracker.take_notch(observation))
-        )
-
-    def _on_lenses(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Output | Request]:
-        for lens in lenses:
-            if not isinstance(lens, LensPose):
+    def _passed_on(self, outcomes: Iterable[Outcome]) -> Iterator[Output | Request]:
+        """What the first stage publishes, and what follows from it in the cores that receive it."""
+        for one in outcomes:
+            if not isinstance(one, Output):
                 continue
-            if self._tracker.follows_rotation:
-                turn = fill_scope_rotation(blank("knee_gap_msgs/msg/ScopeRotation"), lens)
-                yield Output(self._topic("scope_rotation"), turn, lens.stamp_ns)
-                yield self._request("rotation", "scope_rotation", turn)
-            pose = fill_lens_pose(blank("geometry_msgs/msg/PoseWithCovarianceStamped"), lens)
-            yield Output(self._topic("scope_pose"), pose, lens.stamp_ns)
-            yield self._request("pose", "scope_pose", pose)
-            yield from self._segmented("scope_pose", partial(self._detector.on_lens_pose, pose))
+            name = self._name(one.topic)
+            yield one._replace(topic=name)
+            if one.topic == segmentation_core.GAP_EDGES.topic and self._with_mask:
+                mask = self.segmentation.picture(segmentation_core.GAP_MASK)
+                if mask is not None:
+                    yield mask._replace(topic=self._name(mask.topic))
+            if name in self._receivers:
+                yield from self._delivered(name, one.message, one.topic)
 
-    def _request(self, kind: str, what: str, message: Any = None) -> Request:
-        return Request(kind, what, message, self._now_ns)
+    def _delivered(self, name: str, message: Any, what: str) -> Iterator[Output | Request]:
+        """Hand a message to all cores that receive its topic."""
+        given, cores = self._receivers[name]
+        for core in cores:
+            if core is self.uncertainty:
+                yield Request("take", given.topic, what, message, self._now_ns)
+            else:
+                take = partial(core.take, given.topic, message, self._now_ns)
+                yield from self._passed_on(self._seam.call(what, core.recover, take))
 
-    def _segmented(self, what: str, call: Callable[[], None]) -> Iterator[Output | Request]:
-        """Pass an input to the edge stream; return the messages published because of an exception, if any."""
+    def _received(self) -> Iterator[tuple[str, tuple[InputTopic, list[Any]]]]:
+        """Topics in the bag with the cores that receive them, those of the second stage first."""
+        found: dict[str, tuple[InputTopic, list[Any]]] = {}
+        camera_info, *others = self.segmentation.inputs
+        order = (
+            (self.segmentation, [camera_info]),
+            (self.uncertainty, self.uncertainty.inputs),
+            (self.segmentation, others),
+            (self.tracking, self.tracking.inputs),
+        )
+        for core, inputs in order:
+            for given in inputs:
+                _, cores = found.setdefault(self._name(given.topic), (given, []))
+                if core not in cores:
+                    cores.append(core)
+        return iter(found.items())
 
-        def nothing() -> list[GapEdges]:
-            call()
-            return []
+    def _published(self) -> Iterator[OutputTopic]:
+        """Topics to write: those of every run first."""
+        cores = (self.segmentation, self.tracking, self.uncertainty)
+        outputs = [one for core in cores for one in core.outputs]
+        yield from (one for one in outputs if not one.optional)
+        unwritten = () if self._is_calibrated else (segmentation_core.CALIBRATION,)
+        yield from (one for one in outputs if one.optional and one not in unwritten)
+        if self._with_mask:
+            yield segmentation_core.GAP_MASK
 
-        return self._looked_at(self._seam.call(what, self._restart_detector, nothing))
+    def _name(self, topic: str) -> str:
+        return self._names.get(topic, f"{self._space}/{topic}")
 
-    def _restart_detector(self, fault: Fault) -> list[GapEdges]:
-        return self._detector.recover(fault.reason)
 
-    def _restart_tracker(self, _: Fault) -> list[LensPose | Refusal]:
-        self._tracker.reset()
-        return []
-
-    def _looked_at(self, images: Iterable[GapEdges]) -> Iterator[Output | Request]:
-        for edges in self._seam.each("image", self._restart_detector, images):
-            edges_message = fill_gap_edges(
-                blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
-            )
-            yield Output(self._topic("gap_edges"), edges_message, edges.stamp_ns)
-            if self._with_mask and (mask := self._detector.mask()) is not None:
-                yield Output(self._topic("gap_mask"), _mask_message(edges, mask), edges.stamp_ns)
-            yield self._request("edges", "gap_edges", edges_message)
-
-    def _topic(self, name: str) -> str:
-        return f"{self._space}/{name}"
+def log_fault(fault: Fault) -> None:
+    """Log the whole story of an exception at debug level."""
+    _LOG.debug(fault.traceback)
 
 
 def _counted(seam: Seam) -> list[str]:
     return [f"{count} times {fault}" for fault, count in seam.counts.items()]
-
-
-def _mask_message(edges: GapEdges, mask: npt.NDArray[np.uint8]) -> Any:
-    message = blank("sensor_msgs/msg/Image")
-    set_stamp(message.header, edges.stamp_ns)
-    message.header.frame_id, message.encoding = edges.frame_id, "mono8"
-    message.height, message.width = mask.shape
-    message.step, message.data = mask.shape[1], mask.ravel()
-    return message

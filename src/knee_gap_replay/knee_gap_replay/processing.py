@@ -14,6 +14,7 @@ from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.qos import QosName
 from knee_gap_core.bag.writing.bag_writer import SPAN_NS
 from knee_gap_core.node.command_line import with_progress
+from knee_gap_core.node.wiring import Output
 
 _LOG = logging.getLogger(__name__)
 
@@ -24,14 +25,6 @@ _OTHER_CLOCK_NS = 3_600 * 1_000_000_000
 # Messages needed to determine a topic's clock, and the length of the part of the bag that is searched [ns].
 _ENOUGH_MESSAGES = 20
 _CLOCK_SEARCH_NS = 30 * 1_000_000_000
-
-
-class Output(NamedTuple):
-    """A message published by a pipeline, and its stamp [ns]."""
-
-    topic: str
-    message: Any
-    stamp_ns: int
 
 
 class Pipeline(Protocol):

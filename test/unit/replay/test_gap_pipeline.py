@@ -11,16 +11,21 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.node.wiring import Output
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
+from knee_gap_perception.edge_tracking.segmentation_core import SegmentationCore
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.tracking_core import TrackingCore
+from knee_gap_perception.trackers.scope_feed import ScopeFeed
 from knee_gap_replay.pipeline import GapPipeline
-from knee_gap_replay.processing import Output, process
+from knee_gap_replay.processing import process
 from knee_gap_replay.topics import InputTopics
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
+from knee_gap_uncertainty.uncertainty_core import UncertaintyCore
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 
@@ -48,7 +53,8 @@ class TrueEdges:
     def __init__(self) -> None:
         self.camera_seen = False
         self.calibration = None
-        self.size_flaw = ""
+        self.by_notch = False
+        self.size_flaw = self.reason = ""
         self.images: list[Any] = []
         self.pose_stamps: list[int] = []
 
@@ -89,6 +95,17 @@ class TrueEdges:
         )
 
 
+def pipeline_of(edges: TrueEdges, tracker: ScopeTracker, estimator: GapEstimator) -> GapPipeline:
+    """A pipeline of cores over these."""
+    return GapPipeline(
+        SegmentationCore(cast(EdgeStream, edges), blank),
+        TrackingCore(tracker, ScopeFeed(), blank),
+        UncertaintyCore(estimator, blank),
+        TOPICS,
+        "/space",
+    )
+
+
 def stamped(msgtype: str, stamp_ns: int) -> Any:
     message = blank(msgtype)
     set_stamp(message.header, stamp_ns)
@@ -117,9 +134,7 @@ def run(
 ) -> list[Output]:
     """Outputs for a scope tracked until a stamp; `leg_at`: where the leg body is, None where it is lost."""
     parameters = EstimatorParameters(**EXACT_SCOPE, leg_motion=0.5e-3 if leg_at else 0.0)
-    pipeline = GapPipeline(
-        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(parameters), TOPICS, "/space"
-    )
+    pipeline = pipeline_of(TrueEdges(), ScopeTracker(TRACKING), GapEstimator(parameters))
     outputs = list(pipeline.feed("/camera_info", stamped("sensor_msgs/msg/CameraInfo", 0), 0))
     for index in range(end_ns // POSE_PERIOD_NS):
         stamp_ns = index * POSE_PERIOD_NS
@@ -171,9 +186,7 @@ def test_images_stamped_since_boot_are_out_of_sync_as_live(tmp_path: Path, image
                 for topic, msgtype in (("/camera_info", "CameraInfo"), ("/image", "CompressedImage")):
                     message = stamped(f"sensor_msgs/msg/{msgtype}", image_ns + shift_ns)
                     bag.write(topic, message, image_ns + 10_000_000)
-    pipeline = GapPipeline(
-        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
-    )
+    pipeline = pipeline_of(TrueEdges(), ScopeTracker(TRACKING), GapEstimator())
     with BagReader(tmp_path / "bag") as reader, BagWriter(tmp_path / "out") as writer:
         process(reader, writer, pipeline)
     with BagReader(tmp_path / "out") as reader:
@@ -237,9 +250,7 @@ def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
 
 
 def test_every_output_is_announced_with_its_type() -> None:
-    pipeline = GapPipeline(
-        cast(EdgeStream, TrueEdges()), ScopeTracker(TRACKING), GapEstimator(EXACT), TOPICS, "/space"
-    )
+    pipeline = pipeline_of(TrueEdges(), ScopeTracker(TRACKING), GapEstimator(EXACT))
     outputs = run(2_500_000_000, 2_500_000_000)
     assert {o.topic for o in outputs} == set(pipeline.outputs)
     assert all(o.message.__msgtype__ == pipeline.outputs[o.topic][0] for o in outputs)
@@ -290,7 +301,7 @@ def test_what_raises_is_refused_and_the_run_goes_on(faulty: str, monkeypatch: py
     if faulty == "tracker":
         monkeypatch.setattr(tracker, "take", every_tenth(tracker.take))
     source = edges if faulty == "segmentation" else TrueEdges()
-    pipeline = GapPipeline(cast(EdgeStream, source), tracker, estimator, TOPICS, "/space")
+    pipeline = pipeline_of(source, tracker, estimator)
     outputs = list(pipeline.feed("/camera_info", stamped("sensor_msgs/msg/CameraInfo", 0), 0))
     for index in range(120):
         stamp_ns = index * POSE_PERIOD_NS
@@ -314,9 +325,7 @@ def test_what_raises_is_refused_and_the_run_goes_on(faulty: str, monkeypatch: py
 
 
 def test_in_tests_a_fault_is_raised() -> None:
-    pipeline = GapPipeline(
-        cast(EdgeStream, FaultyEdges()), ScopeTracker(TRACKING), GapEstimator(), TOPICS, "/space"
-    )
+    pipeline = pipeline_of(FaultyEdges(), ScopeTracker(TRACKING), GapEstimator())
     list(pipeline.feed("/camera_info", stamped("sensor_msgs/msg/CameraInfo", 0), 0))
     image = "sensor_msgs/msg/CompressedImage"
 

@@ -13,8 +13,9 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.bag.qos import QosName
+from knee_gap_core.node.wiring import Output
 from knee_gap_core.values.stamps import set_stamp
-from knee_gap_replay.processing import Output, by_stamp, process
+from knee_gap_replay.processing import by_stamp, process
 
 POSE = "geometry_msgs/msg/PoseStamped"
 

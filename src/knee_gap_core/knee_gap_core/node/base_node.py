@@ -1,7 +1,7 @@
 """The base of every node: parameters, QoS by purpose, diagnostics, and one way to start and to stop."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import rclpy
@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.node.parameters import as_rows, declare, refuse_unknown, refused_by_ros, require_files
 from knee_gap_core.node.seam import Fault, Seam
+from knee_gap_core.node.wiring import Health
 
 Parameters = TypeVar("Parameters")
 
@@ -31,10 +32,6 @@ LATCHED_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-
-# What a node says of itself once a second: is all well, in a few words, and the counts behind it.
-Health = tuple[bool, str, Mapping[str, object]]
-
 
 # The events of a subscription that a node may handle.
 EVENTS = ("deadline", "incompatible_qos", "liveliness", "message_lost", "incompatible_type", "matched")

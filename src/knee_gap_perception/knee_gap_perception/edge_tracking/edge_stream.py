@@ -105,7 +105,8 @@ class EdgeStream:
         if calibration is not None:
             intrinsics = calibration.require_camera()
             self._use_camera(intrinsics.camera(), calibration.medium, [BearingErrors(intrinsics)])
-        self._wait_ns = round((poses or PoseParameters()).max_pose_wait * 1e9)
+        self.longest_wait = (poses or PoseParameters()).max_pose_wait
+        self._wait_ns = round(self.longest_wait * 1e9)
         self._notch: NotchFollower | None = None
         if by_notch:
             if calibration is None:

@@ -20,10 +20,10 @@ from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import typestore
 from knee_gap_core.bag.writing.bag_writer import serialized
 from knee_gap_core.node.command_line import with_progress
+from knee_gap_core.node.wiring import Output
 from knee_gap_perception.edge_tracking.edge_stream import ReadAhead, read_image
-from knee_gap_replay.pipeline import GapPipeline
-from knee_gap_replay.processing import Fed, LogClock, Output, announce, fed
-from knee_gap_replay.stages.estimation import Request
+from knee_gap_replay.pipeline import GapPipeline, Request
+from knee_gap_replay.processing import Fed, LogClock, announce, fed
 
 _LOG = logging.getLogger(__name__)
 _FORK = multiprocessing.get_context("fork")
@@ -80,10 +80,11 @@ def _second_stage(item: tuple[Any, ...], writer: BagWriter, pipeline: GapPipelin
         topic, data, stamp_ns = item
         writer.write_raw(topic, data, clock.log_ns(stamp_ns))
         return
-    kind, what, data, now_ns = item
-    msgtype, _ = pipeline.estimation.handlers[kind]
-    message = typestore().deserialize_cdr(data, msgtype) if msgtype else None
-    for topic, answer, stamp_ns in pipeline.estimate(Request(kind, what, message, now_ns)):
+    request = Request(*item)
+    if request.topic:
+        msgtype = pipeline.estimated_types[request.topic]
+        request = request._replace(message=typestore().deserialize_cdr(request.message, msgtype))
+    for topic, answer, stamp_ns in pipeline.estimate(request):
         writer.write(topic, answer, clock.log_ns(stamp_ns))
 
 
@@ -158,9 +159,10 @@ class _Packer:
         if isinstance(item, Output):
             data = self._serialized(item.message, self._pipeline.outputs[item.topic][0])
             return (item.topic, data, item.stamp_ns)
-        msgtype, _ = self._pipeline.estimation.handlers[item.kind]
-        data = self._serialized(item.message, msgtype) if msgtype else b""
-        return (item.kind, item.what, data, item.now_ns)
+        if item.topic:
+            msgtype = self._pipeline.estimated_types[item.topic]
+            item = item._replace(message=self._serialized(item.message, msgtype))
+        return tuple(item)
 
     def _serialized(self, message: Any, msgtype: str) -> bytes:
         if message is not self._last:

@@ -1,0 +1,85 @@
+"""The base of a node over a core: it subscribes to, publishes and logs what the core declares and returns."""
+
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+
+from knee_gap_core.bag.message_types import message_class
+from knee_gap_core.node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS, BaseNode
+from knee_gap_core.node.seam import Fault
+from knee_gap_core.node.wiring import Health, InputTopic, NodeCore, Notice, Outcome, OutputTopic, Qos
+
+# The middleware reports to a subscriber that asks for this deadline or a longer one that the node is dead.
+DEADLINE = Duration(nanoseconds=100_000_000)
+# Of each of so many nodes the last message is kept.
+MOST_LATCHING = 8
+PROFILES = {
+    Qos.IMAGE: IMAGE_QOS,
+    Qos.TRACKER: TRACKER_QOS,
+    Qos.RESULT: RESULT_QOS,
+    Qos.DEADLINE: QoSProfile(depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=DEADLINE),
+    Qos.LATCHED: LATCHED_QOS,
+    Qos.LATCHED_BY_SEVERAL: QoSProfile(
+        depth=MOST_LATCHING, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability
+    ),
+}
+
+_class = cache(message_class)
+
+
+def blank(msgtype: str) -> Any:
+    """A default-constructed message of ROS. Raises BagError if its package is not installed."""
+    return _class(msgtype)()
+
+
+class WiredNode(BaseNode):
+    """A node over its `core`, which it makes from its parameters before it opens and listens."""
+
+    core: NodeCore
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, health=self.health)
+        self._outlets: dict[str, Any] = {}
+
+    def declare_all(self, kinds: Iterable[type]) -> list[Any]:
+        """Declare the fields of dataclasses as read-only parameters; return one instance of each."""
+        return [self.declare(kind) for kind in kinds]
+
+    def open_outputs(self, topics: Iterable[OutputTopic]) -> None:
+        """Make publishers."""
+        for topic, msgtype, qos, _ in topics:
+            self._outlets[topic] = self.create_publisher(_class(msgtype), topic, PROFILES[qos])
+
+    def listen(self, given: InputTopic, callback: Callable[..., None]) -> Any:
+        """Subscribe to a topic; report it in log and diagnostics if it is needed and not published."""
+        subscription = self.create_subscription(
+            _class(given.msgtype), given.topic, callback, PROFILES[given.qos]
+        )
+        if given.needed:
+            self.watch_input(given.topic)
+        return subscription
+
+    def publish(self, outcomes: Iterable[Outcome]) -> None:
+        """Publish and log what a core returns, one after the other as it comes."""
+        for one in outcomes:
+            if not isinstance(one, Notice):
+                self._outlets[one.topic].publish(one.message)
+            elif one.is_error:
+                self.get_logger().error(one.words)
+            else:
+                self.log_once(one.reason, one.words)
+
+    def recover(self, fault: Fault) -> None:
+        """Reset the core, and publish what it answers for the message that raised."""
+        self.publish(self.core.recover(fault))
+
+    def now_ns(self) -> int:
+        """Clock for waiting times; with use_sim_time the bag's, so that a slow replay waits longer."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def health(self) -> Health:
+        """Health of the core."""
+        return self.core.health()

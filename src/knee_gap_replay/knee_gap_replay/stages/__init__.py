@@ -1,1 +1,0 @@
-"""The second stage of the pipeline; the first is in `pipeline.py`."""
