@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.poses import BodyPose, FramePose, LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.camera_errors import pupil_shift
@@ -33,18 +34,18 @@ def fill_lens_pose(message: Any, lens: LensPose) -> Any:
     _fill_header(message.header, lens)
     pose = message.pose.pose
     pose.position.x, pose.position.y, pose.position.z = (float(value) for value in lens.position)
-    _fill_quaternion(pose.orientation, lens)
+    _fill_quaternion(pose.orientation, lens.quaternion_xyzw)
     message.pose.covariance = np.array(lens.covariance, dtype=np.float64).reshape(36)
     return message
 
 
-def fill_lens_transform(message: Any, lens: LensPose) -> Any:
+def fill_transform(message: Any, frame: FramePose) -> Any:
     """Set every field of a geometry_msgs/TransformStamped, as /tf carries it; returns the message."""
-    _fill_header(message.header, lens)
-    message.child_frame_id = lens.child_frame_id
+    set_stamp(message.header, frame.stamp_ns)
+    message.header.frame_id, message.child_frame_id = frame.frame_id, frame.child_frame_id
     shift = message.transform.translation
-    shift.x, shift.y, shift.z = (float(value) for value in lens.position)
-    _fill_quaternion(message.transform.rotation, lens)
+    shift.x, shift.y, shift.z = (float(value) for value in frame.position)
+    _fill_quaternion(message.transform.rotation, frame.quaternion_xyzw)
     return message
 
 
@@ -111,5 +112,5 @@ def _fill_header(header: Any, lens: LensPose) -> None:
     header.frame_id = lens.frame_id
 
 
-def _fill_quaternion(message: Any, lens: LensPose) -> None:
-    message.x, message.y, message.z, message.w = (float(value) for value in lens.quaternion_xyzw)
+def _fill_quaternion(message: Any, quaternion_xyzw: Array) -> None:
+    message.x, message.y, message.z, message.w = (float(value) for value in quaternion_xyzw)

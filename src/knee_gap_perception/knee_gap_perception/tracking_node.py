@@ -12,7 +12,8 @@ from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_core.node.wiring import Health
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.scope_pose.tracking_core import NODE, TrackingCore
+from knee_gap_perception.scope_pose.frame_tree import FrameParameters
+from knee_gap_perception.scope_pose.tracking_core import NODE, TRANSFORMS, TrackingCore
 
 # Number of diagnostics, one per second, after which a source without data is reported in the log as well.
 DIAGNOSTICS_TO_LOG = 5
@@ -28,11 +29,14 @@ class TrackingNode(WiredNode):
     def __init__(self) -> None:
         super().__init__(NODE)
         parameters = self.declare_all(TrackingCore.parameters)
+        frames = self.declare(FrameParameters)
         self.refuse_unknown_parameters()
         # Number of diagnostics in a row without a working source.
         self._silent = 0
         try:
             self.core = TrackingCore.from_parameters(parameters, blank, ros_now=self.now_ns)
+            if frames.publish_tf:
+                self.core.broadcast_frames(frames, lambda: self.has_subscribers(TRANSFORMS))
         except PerceptionError as error:
             raise ConfigurationError(str(error)) from error
         self.open_outputs(self.core.outputs)

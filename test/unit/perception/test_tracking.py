@@ -7,12 +7,12 @@ import pytest
 from plain_messages import header, pose
 from scipy.spatial.transform import Rotation
 
-from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
+from knee_gap_core.values.poses import BodyPose, FramePose, LensPose, rigid_transform
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import (
     body_pose_from_message,
     fill_lens_pose,
-    fill_lens_transform,
+    fill_transform,
 )
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason, ValidityParameters
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
@@ -392,15 +392,16 @@ def test_messages_carry_the_pose_there_and_back():
     np.testing.assert_array_equal(read.quaternion_xyzw, lens.quaternion_xyzw)
     np.testing.assert_array_equal(np.reshape(message.pose.covariance, (6, 6)), lens.covariance)
     blank = pose(np.zeros(3))
-    transform = fill_lens_transform(
+    frame = FramePose(lens.stamp_ns, "scope_body", lens.child_frame_id, lens.position, lens.quaternion_xyzw)
+    transform = fill_transform(
         SimpleNamespace(
             header=header(0, ""),
             child_frame_id="",
             transform=SimpleNamespace(translation=blank.position, rotation=blank.orientation),
         ),
-        lens,
+        frame,
     )
-    assert transform.child_frame_id == "arthroscope_optical"
+    assert (transform.header.frame_id, transform.child_frame_id) == ("scope_body", "arthroscope_optical")
     assert transform.transform.translation.x == lens.position[0]
     assert transform.transform.rotation.w == lens.quaternion_xyzw[3]
 

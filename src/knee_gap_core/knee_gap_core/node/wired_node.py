@@ -72,6 +72,10 @@ class WiredNode(BaseNode):
             else:
                 self.log_once(one.reason, one.words)
 
+    def has_subscribers(self, output: OutputTopic) -> bool:
+        """Whether anybody listens to an output."""
+        return bool(self._outlets[output.topic].get_subscription_count())
+
     def recover(self, fault: Fault) -> None:
         """Reset the core, and publish what it answers for the message that raised."""
         self.publish(self.core.recover(fault))

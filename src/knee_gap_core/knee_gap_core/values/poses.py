@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import inf, nan
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,16 @@ class LensPose:
     def matrix(self) -> Array:
         """Return the pose as `T_world_lens` (4, 4), which maps lens coordinates to `frame_id`."""
         return rigid_transform(self.position, self.quaternion_xyzw)
+
+
+class FramePose(NamedTuple):
+    """The pose of a frame in its parent, as /tf has it: `position` (3,) [m], `quaternion_xyzw` (4,)."""
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    position: Array
+    quaternion_xyzw: Array
 
 
 def rigid_transform(position: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> Array:

@@ -166,6 +166,8 @@ class ScopeTracker:
         self.reference_validity = PoseValidity(validity)
         self.turn_validity = PoseValidity(validity)
         self.accepted_count = 0
+        # The bodies of the latest frame that was accepted.
+        self.latest: Tracked | None = None
         T_body_lens = calibration.body_to_lens() if calibration else self.parameters.body_to_lens()
         self._T_body_lens = T_body_lens
         # An image's stamp plus this is the tracker's clock.
@@ -220,7 +222,7 @@ class ScopeTracker:
             refusal = self.validity.refuse(body, RefusalReason.NO_TURN, fault)
         if refusal is not None:
             return refusal
-        tracked = Tracked(body.stamp_ns - self._clock_offset_ns, body, reference)
+        self.latest = tracked = Tracked(body.stamp_ns - self._clock_offset_ns, body, reference)
         if self._by_notch is not None:
             self._by_notch.add_tracked(tracked)
             return None
@@ -236,6 +238,12 @@ class ScopeTracker:
         self.turn_validity.reset()
         if self._by_notch is not None:
             self._by_notch.clear()
+
+    def body_to_lens(self, turn: float) -> Array:
+        """`T_body_lens` (4, 4) at a turn [rad] of the scope in its camera head."""
+        if self.calibration is not None and turn:
+            return self.calibration.body_to_lens(turn)
+        return self._T_body_lens
 
     def _at_images(self) -> list[LensPose | Refusal]:
         if self._by_notch is None:
@@ -280,9 +288,7 @@ class ScopeTracker:
         """Pose of the lens at a turn [rad] of the scope, with its standard error."""
         parameters, body = self.parameters, tracked.body
         R_world_body = Rotation.from_quat(body.quaternion_xyzw)
-        T_body_lens = self._T_body_lens
-        if self.calibration is not None and turn:
-            T_body_lens = self.calibration.body_to_lens(turn)
+        T_body_lens = self.body_to_lens(turn)
         lever = R_world_body.apply(T_body_lens[:3, 3])
         quaternion = (R_world_body * Rotation.from_matrix(T_body_lens[:3, :3])).as_quat(canonical=True)
         covariance = self._covariance(lever) + self._axis_covariance(turn)

@@ -1,20 +1,22 @@
 """The core of tracking_node: tracked bodies and the notch in; lens poses and the scope's rotation out."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
-from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_core.values.poses import BodyPose, FramePose, LensPose
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.messages_tracking import (
     fill_lens_pose,
     fill_scope_calibration,
     fill_scope_rotation,
+    fill_transform,
     notch_from_message,
 )
+from knee_gap_perception.scope_pose.frame_tree import FrameParameters, FrameTree
 from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 from knee_gap_perception.trackers.natnet.client import NatNetParameters
@@ -27,6 +29,9 @@ CALIBRATION = OutputTopic(
     "scope_calibration", "knee_gap_msgs/msg/ScopeCalibration", Qos.LATCHED, optional=True
 )
 SCOPE_ROTATION = OutputTopic("scope_rotation", "knee_gap_msgs/msg/ScopeRotation", Qos.RESULT, optional=True)
+# Frames, not a result of the measurement: broadcast by a live node only.
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TRANSFORMS = OutputTopic("/tf", "tf2_msgs/msg/TFMessage", Qos.RESULT, optional=True)
 
 # A frame of the tracker that contains the scope: its body and the others.
 Frame = tuple[BodyPose, tuple[BodyPose, ...]]
@@ -70,6 +75,8 @@ class TrackingCore:
         self._blank = blank
         self._medium = medium
         self._put = {one.topic: one.put for one in feed.source.subscriptions}
+        self._frames: FrameTree | None = None
+        self._frames_wanted: Callable[[], bool] = lambda: False
         self._accepted_before = 0
         # Rejected poses since the last report of the health, and the reason of the last one.
         self._refused, self._why_refused = 0, ""
@@ -88,7 +95,19 @@ class TrackingCore:
     @property
     def outputs(self) -> tuple[OutputTopic, ...]:
         """The rotation of the scope is published if it is tracked."""
-        return (SCOPE_POSE, CALIBRATION, *([SCOPE_ROTATION] if self.tracker.follows_rotation else []))
+        return (
+            SCOPE_POSE,
+            CALIBRATION,
+            *([SCOPE_ROTATION] if self.tracker.follows_rotation else []),
+            *([TRANSFORMS] if self._frames else []),
+        )
+
+    def broadcast_frames(self, parameters: FrameParameters, wanted: Callable[[], bool]) -> None:
+        """Return the frames of the scope for /tf as well from now on, while they are wanted.
+
+        Raises PerceptionError if two frames have one name.
+        """
+        self._frames, self._frames_wanted = FrameTree(parameters, self.tracker), wanted
 
     def begin(self, now_ns: int) -> list[Outcome]:
         """The calibration in use."""
@@ -155,7 +174,7 @@ class TrackingCore:
     def _note_refused(self, why: str) -> None:
         self._refused, self._why_refused = self._refused + 1, why
 
-    def _reported(self, lenses: Iterable[LensPose | Refusal]) -> Iterator[Outcome]:
+    def _reported(self, lenses: Sequence[LensPose | Refusal]) -> Iterator[Outcome]:
         """Poses of the lens, each after the rotation at it, or why there are none."""
         for lens in lenses:
             if not isinstance(lens, LensPose):
@@ -167,3 +186,11 @@ class TrackingCore:
                 yield Output(SCOPE_ROTATION.topic, rotation, lens.stamp_ns)
             pose = fill_lens_pose(self._blank(SCOPE_POSE.msgtype), lens)
             yield Output(SCOPE_POSE.topic, pose, lens.stamp_ns)
+        if self._frames is not None and self._frames_wanted():
+            yield from self._transforms(self._frames.frames(lenses))
+
+    def _transforms(self, frames: Sequence[FramePose]) -> Iterator[Outcome]:
+        if frames:
+            message = self._blank(TRANSFORMS.msgtype)
+            message.transforms = [fill_transform(self._blank(TRANSFORM), frame) for frame in frames]
+            yield Output(TRANSFORMS.topic, message, frames[-1].stamp_ns)
