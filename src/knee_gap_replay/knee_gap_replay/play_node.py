@@ -150,14 +150,14 @@ def _recorded(topic: Topic) -> QoSProfile:
 
 def _messages(node: PlayNode, reader: BagReader, arguments: argparse.Namespace) -> Iterator[BagMessage]:
     """Return the messages of the part of the bag that is to be played."""
-    messages = reader.messages(node.topics)
     if not arguments.start_offset and arguments.playback_duration is None:
-        return messages
+        return reader.messages(node.topics)
     begin_ns = reader.start_ns + round(arguments.start_offset * 1e9)
     end_ns = None
     if arguments.playback_duration is not None:
         end_ns = begin_ns + round(arguments.playback_duration * 1e9)
     latched = [name for name in node.topics if qos_profiles.is_latched(reader.details[name].qos)]
+    messages = reader.messages(node.topics, begin_ns=begin_ns, before=latched)
     return window(messages, begin_ns, end_ns, latched)
 
 

@@ -13,6 +13,7 @@ from rosbags.interfaces import ConnectionExtRosbag2, QosDurability, QosReliabili
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.bag.mcap_file import Block, Entry, McapFile
 from knee_gap_core.bag.message_types import blank, typestore
 from knee_gap_core.values.stamps import set_stamp
 
@@ -166,3 +167,60 @@ def _zero_chunk_checksums(content: bytes) -> bytes:
             out[offset + 9 + 16 : offset + 9 + 20] = bytes(4)
         offset += 9 + length
     return bytes(out)
+
+
+def write_long(path: Path) -> list[tuple[str, int]]:
+    """Twenty seconds of poses in chunks of a second, with what is kept for late subscribers twice."""
+    written = []
+    with BagWriter(path) as bag:
+        bag.add_topic("/pose", POSE, "sensor")
+        bag.add_topic("/edges", EDGES, "latched")
+        for time_ns in range(0, 20_000_000_000, 100_000_000):
+            bag.write("/pose", pose(time_ns), time_ns)
+            written.append(("/pose", time_ns))
+            if time_ns in (0, 7_500_000_000):
+                bag.write("/edges", blank(EDGES), time_ns)
+                written.append(("/edges", time_ns))
+    return written
+
+
+@pytest.mark.parametrize("indexed", [True, False], ids=["by the index", "without an index"])
+@pytest.mark.parametrize("begin_s", [0.0, 3.0, 7.45, 12.34, 19.9, 25.0])
+def test_what_lies_before_a_time_is_not_read(
+    begin_s: float, indexed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = write_long(tmp_path / "bag")
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    if not indexed:
+        file.write_bytes(file.read_bytes()[:-100])
+    read: list[Block] = []
+    whole = McapFile.read
+
+    def noted(self: McapFile, block: Block) -> list[Entry]:
+        read.append(block)
+        return whole(self, block)
+
+    monkeypatch.setattr(McapFile, "read", noted)
+    begin_ns = round(begin_s * 1e9)
+    with BagReader(tmp_path / "bag") as reader:
+        found = [(m.topic, m.time_ns) for m in reader.messages(begin_ns=begin_ns)]
+        blocks, opened = len(reader._files[0].blocks), len(read)
+        kept = [(m.topic, m.time_ns) for m in reader.messages(begin_ns=begin_ns, before=["/edges"])]
+    wanted = [one for one in written if one[1] >= begin_ns]
+    assert [one for one in found if one[1] >= begin_ns] == wanted
+    assert [one for one in kept if one[0] == "/edges" or one[1] >= begin_ns] == [
+        one for one in written if one[0] == "/edges" or one[1] >= begin_ns
+    ]
+    assert blocks >= 20
+    # At most the chunk in which the time lies is read in vain; and those that hold what is kept.
+    assert opened <= max(blocks - int(begin_s), 0) + 1
+    if indexed:
+        assert len(read) - opened <= opened + 2
+
+
+def test_a_chunk_without_an_end_is_read(tmp_path: Path) -> None:
+    write_long(tmp_path / "bag")
+    with BagReader(tmp_path / "bag") as reader:
+        file = reader._files[0]
+        file.blocks = [block._replace(start_ns=block.start_ns + 1, end_ns=0) for block in file.blocks]
+        assert sum(1 for _ in reader.messages(begin_ns=19_000_000_000)) == 202

@@ -20,7 +20,7 @@ from knee_gap_core.bag import sqlite_file
 from knee_gap_core.bag.bag_paths import missing_bag
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.former_names import topic_today, type_today
-from knee_gap_core.bag.mcap_file import BagFile, McapFile, in_time_order, storage_files
+from knee_gap_core.bag.mcap_file import BagFile, McapFile, Since, in_time_order, storage_files
 from knee_gap_core.bag.message_types import full_name, known_type, typestore
 from knee_gap_core.bag.writing.bag_writer import BagWriter as BagWriter
 from knee_gap_core.bag.writing.mcap_storage import METADATA_RECORD
@@ -118,15 +118,25 @@ class BagReader:
         """One line for each part that could not be read so far; complete once all messages have been read."""
         return (*self._missing, *(line for file in self._files for line in file.losses))
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        begin_ns: int | None = None,
+        before: Collection[str] = (),
+    ) -> Iterator[BagMessage]:
         """Yield the messages of `topics` (all by default), by recorded time.
 
-        Raises BagError for a topic that the bag does not have.
+        With `begin_ns`, what the index shows to be before that time is not read: messages before it may be
+        missing, except those of the topics `before`. Raises BagError for a topic that the bag does not have.
         """
-        if unknown := sorted(set(topics or ()) - set(self.topics)):
+        if unknown := sorted({*(topics or ()), *before} - set(self.topics)):
             names = ", ".join(sorted(self.topics)) or "none"
             raise BagError(f"{self.path} has no topic {', '.join(unknown)}; it has {names}")
-        return self._messages(None if topics is None else frozenset(topics))
+        since = None
+        if begin_ns is not None:
+            since = Since(begin_ns, frozenset(self._recorded[name] for name in before))
+        return self._messages(None if topics is None else frozenset(topics), since)
 
     def deserialize(self, message: BagMessage) -> Any:
         """Return a message of this bag as an object with the message's fields.
@@ -159,10 +169,10 @@ class BagReader:
         seconds, nanoseconds = struct.unpack_from("<iI" if message.data[1] & 1 else ">iI", message.data, 4)
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
-    def _messages(self, topics: frozenset[str] | None) -> Iterator[BagMessage]:
+    def _messages(self, topics: frozenset[str] | None, since: Since | None) -> Iterator[BagMessage]:
         today = {recorded: name for name, recorded in self._recorded.items()}
         recorded_topics = None if topics is None else frozenset(self._recorded[name] for name in topics)
-        for entry in in_time_order(self._files, recorded_topics):
+        for entry in in_time_order(self._files, recorded_topics, since):
             msgtype = self._type_today(entry.schema_name)
             yield BagMessage(today.get(entry.topic, entry.topic), msgtype, entry.time_ns, entry.data)
 

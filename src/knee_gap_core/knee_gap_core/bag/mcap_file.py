@@ -57,13 +57,18 @@ _MOST_WAITING_BYTES = 512 << 20
 
 
 class Block(NamedTuple):
-    """A record that holds messages: a chunk, or a single message of a file without chunks."""
+    """A record that holds messages: a chunk, or a single message of a file without chunks.
+
+    `channels` are those of its messages, None if the file does not tell.
+    """
 
     start_ns: int
     offset: int
     length: int
     is_chunk: bool
     message_count: int
+    end_ns: int
+    channels: frozenset[int] | None = None
 
 
 class Entry(NamedTuple):
@@ -184,7 +189,10 @@ class McapFile:
             heads = len(chunk.message_index_offsets) * (_RECORD_HEAD.size + _INDEX_HEAD_SIZE)
             count = max(0, chunk.message_index_length - heads) // _INDEX_ENTRY_SIZE
             length = chunk.chunk_length - _RECORD_HEAD.size
-            self.blocks.append(Block(chunk.message_start_time, chunk.chunk_start_offset, length, True, count))
+            start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+            channels = frozenset(chunk.message_index_offsets)
+            block = Block(start_ns, chunk.chunk_start_offset, length, True, count, end_ns, channels)
+            self.blocks.append(block)
         for index in summary.metadata_indexes:
             self._file.seek(index.offset + _RECORD_HEAD.size)
             self._note(Opcode.METADATA, index.offset, index.length)
@@ -224,11 +232,11 @@ class McapFile:
 
     def _note(self, opcode: int, offset: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
-            start_ns, _ = _TIMES.unpack(self._file.read(_TIMES.size))
-            self.blocks.append(Block(start_ns, offset, length, True, 0))
+            start_ns, end_ns = _TIMES.unpack(self._file.read(_TIMES.size))
+            self.blocks.append(Block(start_ns, offset, length, True, 0, end_ns))
         elif opcode == Opcode.MESSAGE:
-            _, _, time_ns, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
-            self.blocks.append(Block(time_ns, offset, length, False, 1))
+            channel, _, time_ns, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
+            self.blocks.append(Block(time_ns, offset, length, False, 1, time_ns, frozenset({channel})))
         elif opcode == Opcode.MESSAGE_INDEX and self.blocks:
             entries = max(0, length - _INDEX_HEAD_SIZE) // _INDEX_ENTRY_SIZE
             self.blocks[-1] = self.blocks[-1]._replace(message_count=self.blocks[-1].message_count + entries)
@@ -318,11 +326,36 @@ class BagFile(Protocol):
         """Close the file."""
 
 
-def in_time_order(files: Iterable[BagFile], topics: Collection[str] | None) -> Iterator[Entry]:
-    """Yield the messages of all files, by time, then file, then place; holds only blocks that overlap."""
+class Since(NamedTuple):
+    """From when messages are wanted [ns], and the topics of which those before are wanted all the same."""
+
+    begin_ns: int
+    topics: frozenset[str]
+
+    def wants(self, file: BagFile, block: Block) -> bool:
+        """Whether a block may hold a message that is wanted."""
+        # Some writers leave the end of a chunk out.
+        if block.end_ns >= self.begin_ns or block.end_ns < block.start_ns:
+            return True
+        if block.channels is None:
+            return bool(self.topics)
+        held = (file.channels.get(number) for number in block.channels)
+        return any(channel is not None and channel.topic in self.topics for channel in held)
+
+
+def in_time_order(
+    files: Iterable[BagFile], topics: Collection[str] | None, since: Since | None = None
+) -> Iterator[Entry]:
+    """Yield the messages of all files, by time, then file, then place; holds only blocks that overlap.
+
+    Blocks without a message `since` then are not read; of the others all messages are given.
+    """
     by_number: Mapping[int, BagFile] = dict(enumerate(files))
     blocks = sorted(
-        (block.start_ns, number, block) for number, file in by_number.items() for block in file.blocks
+        (block.start_ns, number, block)
+        for number, file in by_number.items()
+        for block in file.blocks
+        if since is None or since.wants(file, block)
     )
     waiting: list[tuple[int, int, int, int, Entry]] = []
     waiting_bytes = 0

@@ -122,4 +122,6 @@ class SqliteFile:
             starts[-1] = (starts[-1][0], count)
             last_ns = time_ns
         self._ends = [*(start for start, _ in starts[1:]), last_ns + 1]
-        self.blocks = [Block(start, k, 0, False, count) for k, (start, count) in enumerate(starts)]
+        self.blocks = [
+            Block(start, k, 0, False, count, self._ends[k] - 1) for k, (start, count) in enumerate(starts)
+        ]
