@@ -17,8 +17,10 @@ from knee_gap_replay.whole_bags.output import add_force_argument
 
 def _run(arguments: argparse.Namespace) -> int:
     # Only here, so that --help and a mistake of the command line are answered at once.
+    from knee_gap_replay.whole_bags.cluster_pool import ClusterPool
     from knee_gap_replay.whole_bags.many_bags import process_many
     from knee_gap_replay.whole_bags.one_bag import Job, process_one
+    from knee_gap_replay.whole_bags.pools import Pool, ProcessPool
 
     def job(bag: str, out: str, *, replace: bool) -> Job:
         return Job(
@@ -32,8 +34,10 @@ def _run(arguments: argparse.Namespace) -> int:
         )
 
     *bags, out = arguments.bags
-    if len(bags) > 1 or arguments.into:
-        return process_many(bags, Path(out), job, arguments.workers, force=arguments.force)
+    if len(bags) > 1 or arguments.into or arguments.scheduler:
+        address = arguments.scheduler
+        pool: Pool = ClusterPool(address) if address else ProcessPool(arguments.workers)
+        return process_many(bags, Path(out), job, pool, force=arguments.force)
     result = process_one(job(bags[0], out, replace=arguments.force), arguments.workers)
     for line in result.lines:
         print(f"process: {line}", flush=True)
@@ -78,6 +82,12 @@ def _parser() -> Parser:
         type=_workers,
         metavar="N",
         help="processes at once (as many as there are cores): bags, or the two stages of one bag",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="process on a cluster, by Dask (tcp://HOST:8786), whose workers see bags and results under the "
+        "same paths; the last argument is a folder. Needs tools/requirements/cluster.lock",
     )
     parser.add_argument(
         "--params-file",

@@ -8,7 +8,7 @@ import pytest
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.errors import BagError
-from knee_gap_replay.whole_bags import many_bags
+from knee_gap_replay.whole_bags import many_bags, pools
 from knee_gap_replay.whole_bags.one_bag import Job, Result
 
 TYPE = "std_msgs/msg/Float64"
@@ -30,7 +30,7 @@ def do(job: Job, workers: int | None = None) -> Result:
 
 @pytest.fixture(autouse=True)
 def _without_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(many_bags, "process_one", do)
+    monkeypatch.setattr(pools, "process_one", do)
 
 
 def job(bag: str, out: str, *, replace: bool) -> Job:
@@ -38,7 +38,7 @@ def job(bag: str, out: str, *, replace: bool) -> Job:
 
 
 def run(bags: list[str], folder: Path, **options: Any) -> tuple[int, dict[str, dict[str, str]]]:
-    code = many_bags.process_many(bags, folder, job, 2, **options)
+    code = many_bags.process_many(bags, folder, job, pools.ProcessPool(2), **options)
     with (folder / "summary.csv").open() as file:
         return code, {row["bag"]: row for row in csv.DictReader(file)}
 
@@ -87,6 +87,9 @@ def test_a_run_that_was_stopped_goes_on_with_what_is_not_done(
     assert "exists already" in rows["mine"]["remark"]
     assert (folder / "one" / "one_0.mcap").stat().st_mtime_ns == before
     assert "1 bags are done already" in capsys.readouterr().out
+    # However often it is tried.
+    assert run(["mine"], folder)[1]["mine"]["result"] == "failed"
+    assert (folder / "mine" / "mine_0.mcap").read_bytes() == b"of somebody"
     assert run(["one"], folder, force=True)[0] == 0
     assert (folder / "one" / "one_0.mcap").stat().st_mtime_ns > before
 

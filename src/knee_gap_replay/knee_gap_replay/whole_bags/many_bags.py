@@ -1,24 +1,18 @@
-"""Many bags processed by several processes: resumable, and a bag that fails does not stop the others."""
+"""Many bags processed at once: resumable, and a bag that fails does not stop the others."""
 
-import contextlib
 import csv
-import io
 import json
-import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.user_files import FileError, json_value, read_bytes, reason_of
-from knee_gap_core.values.errors import KneeGapError
-from knee_gap_replay.whole_bags.one_bag import Job, process_one
-from knee_gap_replay.whole_bags.overlapped import usable_cores
+from knee_gap_replay.whole_bags.one_bag import Job
+from knee_gap_replay.whole_bags.pools import Ended, Pool
 
-_FORK = multiprocessing.get_context("fork")
 _STATE, _SUMMARY = "process.json", "summary.csv"
 _MOST_STATE_BYTES = 64 << 20
 _COLUMNS = ("bag", "result", "images", "estimates", "valid", "damaged parts", "seconds", "remark")
@@ -43,17 +37,11 @@ class _Row(NamedTuple):
     losses: int = 0
     seconds: float = 0.0
     remark: str = ""
-
-
-class _Running(NamedTuple):
-    process: Any
-    connection: Connection
-    row: _Row
-    begun: float
+    is_ours: bool = True  # what lies at its place was written by such a run, and may be replaced
 
 
 def process_many(
-    bags: Sequence[str], folder: Path, make_job: JobMaker, workers: int | None = None, *, force: bool = False
+    bags: Sequence[str], folder: Path, make_job: JobMaker, pool: Pool, *, force: bool = False
 ) -> int:
     """Process bags into `folder`, one bag of results each, and print a table; return 1 if any failed.
 
@@ -63,38 +51,84 @@ def process_many(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BagError(f"{folder} cannot be made: {reason_of(error)}") from None
-    rows = {} if force else _read_state(folder / _STATE)
-    names = _names(bags)
-    waiting = [bag for bag in names if rows.get(bag, _Row("", "", "")).result != "done"]
-    if skipped := len(names) - len(waiting):
+    state = _State(folder, _names(bags), {} if force else _read_state(folder / _STATE))
+    waiting = state.waiting()
+    if skipped := len(state.names) - len(waiting):
         print(f"process: {skipped} bags are done already", flush=True)
-    running: list[_Running] = []
+    running: set[str] = set()
     try:
         while waiting or running:
-            while waiting and len(running) < (workers or usable_cores()):
+            while waiting and len(running) < pool.size:
                 bag = waiting.pop(0)
-                replace = force or bag in rows
-                rows[bag] = _Row(bag, names[bag], "begun")
-                _write_state(folder / _STATE, rows)
-                running.append(_start(make_job(bag, str(folder / names[bag]), replace=replace), rows[bag]))
-            for ended in _ended(running):
-                running.remove(ended)
-                row = _row_of(ended)
-                rows[row.bag] = row
-                _write_state(folder / _STATE, rows)
-                done = sum(rows[bag].result in ("done", "failed") for bag in names if bag in rows)
-                remark = f": {row.remark}" if row.remark else ""
-                print(f"process: {done} of {len(names)}: {row.bag} {row.result}{remark}", flush=True)
+                out = folder / state.names[bag]
+                replace = force or state.is_ours(bag)
+                if os.path.lexists(out) and not replace:
+                    state.end(Ended(bag, "failed", f"{out} exists already", {}), is_ours=False)
+                    continue
+                state.begin(bag)
+                running.add(bag)
+                pool.start(bag, make_job(bag, str(out), replace=replace))
+            for ended in pool.ended() if running else ():
+                running.discard(ended.bag)
+                state.end(ended)
     finally:
-        for left in running:
-            left.process.terminate()
-            left.process.join()
-    ordered = [rows[bag] for bag in names]
-    _write_summary(folder / _SUMMARY, ordered)
-    print(_table(ordered), flush=True)
-    failed = sum(row.result != "done" for row in ordered)
-    print(f"process: {len(ordered) - failed} bags done, {failed} failed; results in {folder}", flush=True)
-    return 1 if failed else 0
+        for ended in pool.close():
+            state.end(ended)
+    return state.finish()
+
+
+class _State:
+    """The row of each bag, kept in a file so that a run that was stopped goes on."""
+
+    def __init__(self, folder: Path, names: dict[str, str], rows: dict[str, _Row]) -> None:
+        self.names = names
+        self._folder, self._rows = folder, rows
+        self._begun: dict[str, float] = {}
+
+    def waiting(self) -> list[str]:
+        """Return the bags that are not done."""
+        return [bag for bag in self.names if bag not in self._rows or self._rows[bag].result != "done"]
+
+    def is_ours(self, bag: str) -> bool:
+        """Whether an earlier run began this bag, so that what it left may be replaced."""
+        return bag in self._rows and self._rows[bag].is_ours
+
+    def begin(self, bag: str) -> None:
+        """Note that a bag is begun."""
+        self._begun[bag] = time.monotonic()
+        self._write(_Row(bag, self.names[bag], "begun"))
+
+    def end(self, ended: Ended, *, is_ours: bool = True) -> None:
+        """Note how a bag ended, and print it."""
+        bag, counts = ended.bag, ended.counts
+
+        def count(name: str) -> int:
+            return sum(n for topic, n in counts.items() if topic.endswith(f"/{name}"))
+
+        seconds = time.monotonic() - self._begun.get(bag, time.monotonic())
+        row = _Row(
+            bag, self.names[bag], ended.result, count("gap_edges"), count("gap"), count("gap/snr"),
+            ended.losses, round(seconds, 2), ended.remark, is_ours,
+        )  # fmt: skip
+        self._write(row)
+        rows = [self._rows[name] for name in self.names if name in self._rows]
+        done = sum(one.result in ("done", "failed") for one in rows)
+        remark = f": {row.remark}" if row.remark else ""
+        print(f"process: {done} of {len(self.names)}: {bag} {row.result}{remark}", flush=True)
+
+    def finish(self) -> int:
+        """Write and print the table; return 1 if a bag failed."""
+        ordered = [self._rows[bag] for bag in self.names]
+        _write_summary(self._folder / _SUMMARY, ordered)
+        print(_table(ordered), flush=True)
+        failed = sum(row.result != "done" for row in ordered)
+        words = f"{len(ordered) - failed} bags done, {failed} failed; results in {self._folder}"
+        print(f"process: {words}", flush=True)
+        return 1 if failed else 0
+
+    def _write(self, row: _Row) -> None:
+        self._rows[row.bag] = row
+        _write_state(self._folder / _STATE, self._rows)
 
 
 def _names(bags: Sequence[str]) -> dict[str, str]:
@@ -108,64 +142,6 @@ def _names(bags: Sequence[str]) -> dict[str, str]:
             name, number = f"{stem}_{number}", number + 1
         names[bag] = name
     return names
-
-
-def _start(job: Job, row: _Row) -> _Running:
-    ours, theirs = _FORK.Pipe(duplex=False)
-    process = _FORK.Process(target=_work, args=(job, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    return _Running(process, ours, row, time.monotonic())
-
-
-def _work(job: Job, connection: Connection) -> None:
-    """Process one bag in a process of its own, and send how it went."""
-    # Nobody to tell any more, or an end from outside: the state then says that the bag was begun.
-    with contextlib.suppress(BrokenPipeError, KeyboardInterrupt):
-        connection.send(_outcome(job))
-
-
-def _outcome(job: Job) -> tuple[str, str, dict[str, int], int, int]:
-    # Bars of several bags would overwrite each other.
-    with contextlib.redirect_stderr(io.StringIO()):
-        try:
-            result = process_one(job, workers=1)
-        except (KneeGapError, OSError) as error:
-            return ("failed", str(error), {}, 0, 0)
-    remark = result.lines[-1] if result.exit_code else "; ".join(result.lines[:-1])
-    valid = sum(count for topic, count in result.counts.items() if topic.endswith("/gap/snr"))
-    return ("failed" if result.exit_code else "done", remark, result.counts, result.losses, valid)
-
-
-def _ended(running: Sequence[_Running]) -> list[_Running]:
-    """Return those that have ended, after waiting for at least one."""
-    ready = wait([one.connection for one in running])
-    return [one for one in running if one.connection in ready]
-
-
-def _row_of(ended: _Running) -> _Row:
-    seconds = time.monotonic() - ended.begun
-    try:
-        result, remark, counts, losses, valid = ended.connection.recv()
-    except EOFError:
-        ended.process.join()
-        remark = f"its process ended with {ended.process.exitcode}"
-        return ended.row._replace(result="failed", remark=remark, seconds=seconds)
-    ended.process.join()
-    ended.connection.close()
-
-    def count(name: str) -> int:
-        return sum(n for topic, n in counts.items() if topic.endswith(f"/{name}"))
-
-    return ended.row._replace(
-        result=result,
-        remark=remark,
-        images=count("gap_edges"),
-        estimates=count("gap"),
-        valid=valid,
-        losses=losses,
-        seconds=round(seconds, 2),
-    )
 
 
 def _read_state(path: Path) -> dict[str, _Row]:
