@@ -224,6 +224,15 @@ class GapEstimator:
         assert verdict is not None
         return [self._without(edges.stamp_ns, edges.track_id, verdict)]
 
+    def break_input(self, topic: str) -> None:
+        """End the track and forget the poses: the next message of a topic does not continue those before.
+
+        Two publishers, or one that was started again, are then never measured with together.
+        """
+        self.counts[f"messages of {topic} that do not continue those before"] += 1
+        self._track = None
+        self._poses.clear()
+
     def _turn_clock(self, now_ns: int) -> None:
         """Take the time; where it runs backwards (a bag that starts again) nothing waits any longer."""
         if now_ns < self._now_ns:

@@ -1,6 +1,7 @@
 """uncertainty_node: gap_edges and scope_pose in; gap, its bounds, and motion_advice out."""
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -11,12 +12,15 @@ from knee_gap_core.node.base_node import run
 from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.inputs.delays import ContinuedClock
+from knee_gap_uncertainty.inputs.message_sequence import MessageSequence
 from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
-from knee_gap_uncertainty.uncertainty_core import NODE, UncertaintyCore
+from knee_gap_uncertainty.uncertainty_core import GAP_EDGES, NODE, SCOPE_POSE, SCOPE_ROTATION, UncertaintyCore
 from knee_gap_uncertainty.warm_up import warm_up
 
 # How often time is let pass when no message does it [s].
 TICK = 0.02
+# Topics of one publisher each, whose messages continue one another.
+CONTINUED = (GAP_EDGES.topic, SCOPE_POSE.topic, SCOPE_ROTATION.topic)
 
 
 class UncertaintyNode(WiredNode):
@@ -29,6 +33,7 @@ class UncertaintyNode(WiredNode):
         estimator = GapEstimator(*self.declare_all(UncertaintyCore.parameters))
         self.refuse_unknown_parameters()
         self._continued_clock = ContinuedClock()
+        self._sequences: defaultdict[str, MessageSequence] = defaultdict(MessageSequence)
         self.core = UncertaintyCore(estimator, blank, clock=self.now_ns, pace=AdvicePace(TICK))
         self.open_outputs(self.core.outputs)
         # Published before the first image comes, so that a deadline can fire from now on.
@@ -46,8 +51,17 @@ class UncertaintyNode(WiredNode):
 
     def on_message(self, topic: str, message: Any, info: Mapping[str, int | None]) -> None:
         """Receive a message, and publish the estimates that it made possible."""
+        if topic in CONTINUED:
+            self.check_sequence(topic, info)
         queued_ns = self.queued_ns(info)
         self.publish(self.core.take(topic, message, self.now_ns(), queued_ns))
+
+    def check_sequence(self, topic: str, info: Mapping[str, int | None]) -> None:
+        """End the track if a message does not continue those before, as with two publishers of a topic."""
+        if not self._sequences[topic].continues(info.get("publication_sequence_number")):
+            self.core.estimator.break_input(topic)
+            words = "two nodes publish it, it was started again, or messages were lost"
+            self.log_once(f"sequence of {topic}", f"the messages of {topic} have a break: {words}")
 
     def queued_ns(self, info: Mapping[str, int | None]) -> int:
         """How long a message lay in this node's queue: if poses and images lie alike, both are late.

@@ -166,6 +166,33 @@ def test_another_track_starts_from_its_own_first_view() -> None:
     assert {e.baseline for e in estimates} == {0.0}
 
 
+@pytest.mark.parametrize("topic", ["gap_edges", "scope_pose"])
+def test_what_does_not_continue_ends_the_track_and_is_not_measured_with(topic: str) -> None:
+    estimator = GapEstimator(EXACT)
+    assert run(estimator, TRAVEL)[-1].status is GapStatus.VALID
+    estimator.break_input(topic)
+    begin = 10**9 + len(TRAVEL) * FRAME_NS
+    after = run(estimator, [TRAVEL[-1]] * 3, begin=begin)
+    assert [one.status for one in after] == [GapStatus.INSUFFICIENT_PARALLAX] * 3
+    assert estimator.counts[f"messages of {topic} that do not continue those before"] == 1
+    again = run(estimator, list(np.add(TRAVEL, TRAVEL[-1])), begin=begin + 3 * FRAME_NS)
+    assert again[-1].status is GapStatus.VALID
+
+
+def test_poses_of_two_publishers_in_turn_make_nothing_valid() -> None:
+    estimator, statuses = GapEstimator(EXACT), []
+    for k, x in enumerate(np.linspace(0.0, 0.006, 60)):
+        stamp = 10**9 + k * FRAME_NS
+        estimator.break_input("scope_pose")
+        statuses += estimator.add_pose(pose(stamp - 2 * MS, x + 0.005), stamp)
+        estimator.break_input("scope_pose")
+        statuses += estimator.add_pose(pose(stamp - MS, x), stamp)
+        statuses += estimator.add_edges(edges(stamp, x), stamp + MS)
+        statuses += estimator.add_pose(pose(stamp + MS, x), stamp + 2 * MS)
+    assert len(statuses) == 60
+    assert GapStatus.VALID not in {one.status for one in statuses}
+
+
 def test_bag_that_starts_again_keeps_nothing_of_before() -> None:
     estimator = GapEstimator(EXACT)
     before = run(estimator, TRAVEL)
