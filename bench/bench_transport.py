@@ -123,7 +123,8 @@ def run(bag: Path, out: Path, domain: int, nodes: Sequence[str]) -> Run:
 def command(node: str, bag: Path) -> list[str]:
     """How a node is started."""
     if node == "floor":
-        return [sys.executable, str(Path(__file__).with_name("decode_only.py"))]
+        floor = str(Path(__file__).with_name("decode_only.py"))
+        return [sys.executable, floor, "--ros-args", "-r", "__ns:=/knee_gap"]
     started = [executable(NODES[node], node), "--ros-args", "-r", "__ns:=/knee_gap"]
     if node == "segmentation_node":
         started += ["-p", "image_transport:=compressed"]

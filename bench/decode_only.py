@@ -1,4 +1,4 @@
-"""The floor of bench_transport: a node that receives compressed images, decodes them and answers each."""
+"""A bare subscriber for bench_transport and bench_load: it decodes compressed images and answers each."""
 
 import sys
 from collections.abc import Mapping
@@ -16,8 +16,8 @@ class DecodeOnlyNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("decode_only", health=self.health)
-        self._edges = self.create_publisher(GapEdges, "/knee_gap/gap_edges", RESULT_QOS)
-        self.create_subscription(CompressedImage, "/knee_gap/image_raw/compressed", self.on_image, IMAGE_QOS)
+        self._edges = self.create_publisher(GapEdges, "gap_edges", RESULT_QOS)
+        self.create_subscription(CompressedImage, "image_raw/compressed", self.on_image, IMAGE_QOS)
 
     def on_image(self, message: CompressedImage) -> None:
         """Decode and answer."""
