@@ -26,14 +26,13 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edge_messages import edges_from_message, fill_gap_edges
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.pose_messages import fill_lens_pose, lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.models import FisheyeCamera, bearing_jacobian
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
-from knee_gap_perception.messages_tracking import fill_lens_pose
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 
@@ -154,7 +153,7 @@ class GapCheck:
             blank("knee_gap_msgs/msg/GapEdges"), edges, lambda: blank("knee_gap_msgs/msg/GapSection")
         )
         now = edges.stamp_ns
-        estimates = self._estimator.add_pose(messages.pose_from_message(posed), now)
+        estimates = self._estimator.add_pose(lens_pose_from_message(posed), now)
         estimates += self._estimator.add_edges(edges_from_message(seen), now)
         for estimate in estimates:
             if estimate.status is GapStatus.VALID:

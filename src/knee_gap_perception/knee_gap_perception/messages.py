@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from knee_gap_core.values.arrays import Image
+from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
-from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.image.encodings import decoded
 
@@ -68,27 +68,19 @@ def image_from_compressed(message: Any) -> Image:
     return np.asarray(image, dtype=np.uint8)
 
 
-def lens_pose_from_message(message: Any) -> LensPose:
+def checked_lens_pose(message: Any) -> LensPose:
     """Lens pose of a geometry_msgs/PoseWithCovarianceStamped.
 
     Raises PerceptionError for an invalid stamp, numbers that are not finite or out of range, and a quaternion
     that is not of unit length.
     """
     refuse_stamp(message.header)
-    place, turn = message.pose.pose.position, message.pose.pose.orientation
-    position = np.array([place.x, place.y, place.z], dtype=np.float64)
-    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64)
-    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    lens = lens_pose_from_message(message)
+    position, quaternion, covariance = lens.position, lens.quaternion_xyzw, lens.covariance
     if not np.isfinite(np.concatenate([position, quaternion, covariance.ravel()])).all():
         raise PerceptionError("a lens pose must be finite")
     if not is_unit(quaternion):
         raise PerceptionError(f"the quaternion of a lens pose must be of unit length, not {quaternion}")
     if np.abs(position).max() > FARTHEST or np.abs(covariance).max() > FARTHEST**2:
         raise PerceptionError(f"a lens pose and its error must lie within {FARTHEST:g} m, not {position} m")
-    return LensPose(
-        stamp_ns=stamp_ns(message.header),
-        frame_id=str(message.header.frame_id),
-        position=position,
-        quaternion_xyzw=quaternion,
-        covariance=covariance,
-    )
+    return lens

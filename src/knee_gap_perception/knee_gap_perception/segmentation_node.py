@@ -24,8 +24,8 @@ from knee_gap_perception.edge_tracking.segmentation_core import (
     SCOPE_POSE,
     SegmentationCore,
 )
+from knee_gap_perception.edge_tracking.warm_up import warm_up
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.warm_up import warm_up
 
 # How often it is looked which of the image topics is published, until one is [s].
 TRANSPORT_LOOK = 0.1

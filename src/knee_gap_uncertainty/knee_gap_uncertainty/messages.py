@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from knee_gap_core.values.gap_estimate import GapEstimate
+from knee_gap_core.values.pose_messages import body_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
@@ -27,32 +28,20 @@ SHARES = (
 NUMBERS = tuple(field.name for field in fields(GapEstimate) if field.type is float)
 
 
-def pose_from_message(message: Any) -> LensPose:
-    """Lens pose of a geometry_msgs/PoseWithCovarianceStamped."""
-    p, q = message.pose.pose.position, message.pose.pose.orientation
-    return LensPose(
-        stamp_ns=stamp_ns(message.header),
-        frame_id=str(message.header.frame_id),
-        position=np.array([p.x, p.y, p.z], dtype=float),
-        quaternion_xyzw=np.array([q.x, q.y, q.z, q.w], dtype=float),
-        covariance=np.array(message.pose.covariance, dtype=float).reshape(6, 6),
-    )
-
-
 def leg_pose_from_message(message: Any) -> LensPose:
-    """Pose of the leg body of a geometry_msgs/PoseStamped, which tells no error."""
-    p, q = message.pose.position, message.pose.orientation
+    """Pose of the leg body of a geometry_msgs/PoseStamped, which has no error."""
+    body = body_pose_from_message(message)
     return LensPose(
-        stamp_ns=stamp_ns(message.header),
+        stamp_ns=body.stamp_ns,
         frame_id=str(message.header.frame_id),
-        position=np.array([p.x, p.y, p.z], dtype=float),
-        quaternion_xyzw=np.array([q.x, q.y, q.z, q.w], dtype=float),
+        position=body.position,
+        quaternion_xyzw=body.quaternion_xyzw,
         covariance=np.zeros((6, 6)),
     )
 
 
 def calibration_from_message(message: Any) -> ScopeCalibration:
-    """What a knee_gap_msgs/ScopeCalibration says."""
+    """The calibration of a knee_gap_msgs/ScopeCalibration."""
     return ScopeCalibration(
         node=str(message.node),
         hash=str(message.hash),
@@ -63,7 +52,7 @@ def calibration_from_message(message: Any) -> ScopeCalibration:
 
 
 def rotation_from_message(message: Any) -> ScopeRotation:
-    """What a knee_gap_msgs/ScopeRotation says."""
+    """The rotation of a knee_gap_msgs/ScopeRotation."""
     return ScopeRotation(stamp_ns(message.header), float(message.turn))
 
 

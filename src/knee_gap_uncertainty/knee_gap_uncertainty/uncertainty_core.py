@@ -8,6 +8,7 @@ from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
 from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
+from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.acceptance import Reason
@@ -76,7 +77,7 @@ class UncertaintyCore:
         if topic == GAP_EDGES.topic:
             return list(self._published(estimator.add_edges(edges_from_message(message), now_ns)))
         if topic == SCOPE_POSE.topic:
-            pose = messages.pose_from_message(message)
+            pose = lens_pose_from_message(message)
             return list(self._published(estimator.add_pose(pose, now_ns, queued_ns)))
         if topic == SCOPE_ROTATION.topic:
             rotation = messages.rotation_from_message(message)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
+from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty import messages
 from knee_gap_uncertainty.estimator import GapEstimator
@@ -77,7 +78,7 @@ def take(estimator: GapEstimator, draw: Any, stamp_ns: int, now_ns: int) -> list
     """Hand the estimator a message of any kind."""
     kind = draw(st.sampled_from(["pose"] * 5 + ["edges"] * 4 + ["turn", "leg", "calibration", "time"]))
     if kind == "pose":
-        pose = messages.pose_from_message(draw(poses(stamp_ns)))
+        pose = lens_pose_from_message(draw(poses(stamp_ns)))
         return estimator.add_pose(pose, now_ns, draw(st.sampled_from([0, 10**7, 10**12])))
     if kind == "edges":
         return estimator.add_edges(edges_from_message(edges(draw, stamp_ns)), now_ns)
@@ -148,7 +149,7 @@ def test_a_track_that_is_hurt(moved: GapEstimator, data: Any) -> None:
 def test_the_pose_buffer(given_poses: list[tuple[int, Any]], steps: list[int]) -> None:
     buffer = PoseBuffer()
     for stamp, message in given_poses:
-        refusal = buffer.add(messages.pose_from_message(message))
+        refusal = buffer.add(lens_pose_from_message(message))
         assert refusal is None or refusal.value
         for step in steps:
             pose = buffer.at(stamp + step)

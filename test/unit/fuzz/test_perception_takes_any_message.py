@@ -20,7 +20,7 @@ from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.image.encodings import ENCODINGS
-from knee_gap_perception.messages import image_from_message, lens_pose_from_message
+from knee_gap_perception.messages import checked_lens_pose, image_from_message
 from knee_gap_perception.messages_tracking import notch_from_message
 from knee_gap_perception.scope_pose.pose_validity import Refusal
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
@@ -59,7 +59,7 @@ def test_prediction_of_the_lens_pose(messages: list[tuple[int, Any]], steps: lis
     predictor = LensPosePredictor()
     for stamp, message in messages:
         with suppress(PerceptionError):
-            predictor.add(lens_pose_from_message(message))
+            predictor.add(checked_lens_pose(message))
         for step in steps:
             lens = predictor.at(stamp + step)
             if lens is not None:

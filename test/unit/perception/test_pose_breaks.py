@@ -9,10 +9,10 @@ import pytest
 from plain_messages import bgr_image, header, pose
 
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
+from knee_gap_core.values.pose_messages import fill_lens_pose
 from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import PoseParameters
-from knee_gap_perception.messages_tracking import fill_lens_pose
 from knee_gap_perception.point_tracking.point_tracker import PointTracker
 from knee_gap_perception.scope_pose.pose_validity import RefusalReason, ValidityParameters
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters

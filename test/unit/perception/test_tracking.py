@@ -7,13 +7,9 @@ import pytest
 from plain_messages import header, pose
 from scipy.spatial.transform import Rotation
 
+from knee_gap_core.values.pose_messages import body_pose_from_message, fill_lens_pose, fill_transform
 from knee_gap_core.values.poses import BodyPose, FramePose, LensPose, rigid_transform
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.messages_tracking import (
-    body_pose_from_message,
-    fill_lens_pose,
-    fill_transform,
-)
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason, ValidityParameters
 from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
 

@@ -1,8 +1,8 @@
 """After warming up nothing is compiled any more."""
 
 from knee_gap_core.values.edges import EdgeStatus
+from knee_gap_perception.edge_tracking.warm_up import warm_up
 from knee_gap_perception.point_tracking import patch_fit
-from knee_gap_perception.warm_up import warm_up
 
 
 def test_warm_up_follows_a_gap_and_so_compiles_the_kernel() -> None:

@@ -25,7 +25,7 @@ from knee_gap_replay.processing import by_stamp
 from knee_gap_replay.topics import InputTopics
 from pathlib import Path
 import sys
-from knee_gap_perception.warm_up import warm_up as warm_up_perception
+from knee_gap_perception.edge_tracking.warm_up import warm_up as warm_up_perception
 warm_up_perception()
 late.clear()
 bag = Path(sys.argv[1])

@@ -28,9 +28,9 @@ from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.messages import (
+    checked_lens_pose,
     image_from_compressed,
     image_from_message,
-    lens_pose_from_message,
     refuse_stamp,
 )
 from knee_gap_perception.scope_rotation.notch_tracker import NotchFollower, NotchObservation
@@ -166,7 +166,7 @@ class EdgeStream:
     def on_lens_pose(self, message: Any) -> None:
         """Take a pose of the lens, a geometry_msgs/PoseWithCovarianceStamped; a bad one is left out."""
         try:
-            self._poses.add(lens_pose_from_message(message))
+            self._poses.add(checked_lens_pose(message))
         except PerceptionError:
             self.counts["lens poses refused"] += 1
 

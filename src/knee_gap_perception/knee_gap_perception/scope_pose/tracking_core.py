@@ -6,14 +6,13 @@ from typing import Any, Self
 
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
+from knee_gap_core.values.pose_messages import fill_lens_pose, fill_transform
 from knee_gap_core.values.poses import BodyPose, FramePose, LensPose
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.camera.medium import Medium
 from knee_gap_perception.messages_tracking import (
-    fill_lens_pose,
     fill_scope_calibration,
     fill_scope_rotation,
-    fill_transform,
     notch_from_message,
 )
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters, FrameTree
