@@ -16,7 +16,7 @@ from knee_gap_bringup.launching.processes import Processes, executable
 from knee_gap_msgs.msg import GapEstimate, ScopeNotch
 from knee_gap_perception.calibration.calibration_file import load_calibration
 from knee_gap_replay.report.comparison import compare
-from knee_gap_simulation.make_bag import Recording, make_bag
+from knee_gap_simulation.make_bag.command import Recording, make_bag
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE
 
 DOMAIN = 63

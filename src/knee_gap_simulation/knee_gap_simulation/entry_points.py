@@ -2,7 +2,7 @@
 
 from knee_gap_core.node.entry import entry
 
-compare_looks = entry("knee_gap_simulation.compare_looks")
-contact_sheet = entry("knee_gap_simulation.contact_sheet")
-make_bag = entry("knee_gap_simulation.make_bag")
+compare_looks = entry("knee_gap_simulation.look_checks.compare_looks")
+contact_sheet = entry("knee_gap_simulation.look_checks.contact_sheet")
+make_bag = entry("knee_gap_simulation.make_bag.command")
 natnet_server = entry("knee_gap_simulation.natnet.command")

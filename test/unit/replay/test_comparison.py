@@ -14,7 +14,7 @@ from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, rigid
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_replay.report.comparison import EDGES, GAP, Comparison, compare
-from knee_gap_simulation.make_bag import Recording, make_bag
+from knee_gap_simulation.make_bag.command import Recording, make_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_uncertainty.messages import fill_gap_estimate

@@ -11,7 +11,7 @@ from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
 from knee_gap_replay.evaluation.command import main
 from knee_gap_replay.process import main as process
-from knee_gap_simulation.make_bag import Recording, make_bag
+from knee_gap_simulation.make_bag.command import Recording, make_bag
 
 MASK, TRUTH = "/knee_gap/gap_mask", "/knee_gap/gap_mask_true"
 

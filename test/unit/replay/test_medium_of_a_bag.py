@@ -7,7 +7,7 @@ import pytest
 
 from knee_gap_replay import process
 from knee_gap_replay.report.comparison import Comparison, compare
-from knee_gap_simulation.make_bag import Recording, make_bag
+from knee_gap_simulation.make_bag.command import Recording, make_bag
 
 pytestmark = pytest.mark.timeout(900)  # 67 images are rendered
 

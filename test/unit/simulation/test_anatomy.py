@@ -17,7 +17,7 @@ from knee_gap_simulation.anatomy.posing import Compartment
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.ground_truth import Visibility
 from knee_gap_simulation.knee_simulator import Anatomy, KneeSimulator
-from knee_gap_simulation.make_bag import main
+from knee_gap_simulation.make_bag.command import main
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
 from knee_gap_simulation.surfaces.distance_field import CONDYLE, PLATEAU
 

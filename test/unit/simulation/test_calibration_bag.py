@@ -17,7 +17,7 @@ from knee_gap_simulation.calibration.bag import (
 )
 from knee_gap_simulation.calibration.scene import BoardCamera, RotatedScope
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.make_bag import main
+from knee_gap_simulation.make_bag.command import main
 
 SMALL = CalibrationRecording(seed=5, fps=5, board_s=0.6, oblique_s=0.6, pivot_s=0.5)
 

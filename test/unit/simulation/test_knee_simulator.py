@@ -9,12 +9,12 @@ import pytest
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.user_files import FileError
 from knee_gap_core.values.rigid_transforms import inverse
-from knee_gap_simulation.contact_sheet import contact_sheet, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Difficulty, conditions
 from knee_gap_simulation.knee.ground_truth import Visibility
 from knee_gap_simulation.knee_simulator import LEAST_CLEARANCE, KneeSimulator
-from knee_gap_simulation.make_bag import main
+from knee_gap_simulation.look_checks.contact_sheet import contact_sheet, read_frames
+from knee_gap_simulation.make_bag.command import main
 from knee_gap_simulation.recordings.recording import IMAGE, LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
 

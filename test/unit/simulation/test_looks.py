@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.bag import BagReader
-from knee_gap_simulation.compare_looks import main as compare
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import Difficulty, conditions
 from knee_gap_simulation.knee_simulator import KneeSimulator
+from knee_gap_simulation.look_checks.compare_looks import main as compare
 from knee_gap_simulation.looks.border import field_border
 from knee_gap_simulation.looks.look import Appearance, Look
 from knee_gap_simulation.looks.statistics import FEATURES, features, separability
 from knee_gap_simulation.looks.video import tone
-from knee_gap_simulation.make_bag import main
+from knee_gap_simulation.make_bag.command import main
 from knee_gap_simulation.recordings.scene_truth import scene_from_metadata
 from knee_gap_simulation.scope.lens import Lens
 

@@ -11,7 +11,7 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_simulation.calibration.bag import CalibrationRecording, calibration_truth
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator
-from knee_gap_simulation.make_bag import Recording, main, make_bag
+from knee_gap_simulation.make_bag.command import Recording, main, make_bag
 from knee_gap_simulation.recordings.scene_truth import METADATA_KEY, scene_from_metadata
 from knee_gap_simulation.scope.hand_motion import HandMotion, TravelDirection
 from knee_gap_simulation.scope.lens import Lens

@@ -11,7 +11,7 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_simulation.errors import SimulationError
-from knee_gap_simulation.make_bag import Recording, main, make_bag
+from knee_gap_simulation.make_bag.command import Recording, main, make_bag
 from knee_gap_simulation.recordings.recording import BODY_POSE, CAMERA_INFO, IMAGE, LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 from knee_gap_simulation.rims.render import ScopeCamera

@@ -10,9 +10,9 @@ from tqdm import tqdm
 from knee_gap_core.node.arguments import Parser
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import KneeGapError
-from knee_gap_simulation.contact_sheet import moment, read_frames
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.difficulty import LEVELS
+from knee_gap_simulation.look_checks.contact_sheet import moment, read_frames
 from knee_gap_simulation.looks.look import Appearance
 from knee_gap_simulation.looks.statistics import known, separability, table
 

@@ -17,7 +17,6 @@ from knee_gap_core.user_files import flaw_of_new
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import KneeGapError
 from knee_gap_core.values.rigid_transforms import inverse
-from knee_gap_simulation.bag_arguments import bag_parser
 from knee_gap_simulation.calibration.bag import (
     CalibrationRecording,
     calibration_truth,
@@ -27,6 +26,7 @@ from knee_gap_simulation.calibration.scene import RotatedScope
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import FROM_SEED, Anatomy, KneeSimulator
 from knee_gap_simulation.looks.look import Appearance
+from knee_gap_simulation.make_bag.arguments import bag_parser
 from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
     Sample,
