@@ -33,7 +33,7 @@ from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)

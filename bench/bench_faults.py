@@ -39,7 +39,7 @@ from knee_gap_simulation.recordings.recording import (
     PARAMETERS_FILE,
 )
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 
 LARGEST_SHARE, LARGEST_MISS = 1e-3, 0.5e-3  # of a creeping body: share of VALID, and by how much [m]

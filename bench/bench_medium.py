@@ -27,7 +27,7 @@ from knee_gap_perception.camera.medium import AIR, SALINE
 from knee_gap_perception.camera.models import Camera, bearing_jacobian, camera_from_info, camera_in_medium
 from knee_gap_simulation.recordings.recording import camera_info_message
 from knee_gap_simulation.scope.lens import Lens
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration
 
 GAP = 0.004

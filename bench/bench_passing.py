@@ -25,7 +25,7 @@ from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator
 from knee_gap_simulation.knee_views import ViewDrawer, edges_seen, points_beside
 from knee_gap_simulation.recordings.section_truth import true_instrument_gap
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 
 TOO_THICK = 0.05e-3

@@ -21,9 +21,9 @@ from knee_gap_perception.scope_pose import tracking_core
 from knee_gap_perception.scope_pose.tracking_core import TrackingCore
 from knee_gap_perception.trackers.scope_feed import SCOPE_TOPIC, SourceParameters
 from knee_gap_replay.topics import InputTopics
-from knee_gap_uncertainty import uncertainty_core
-from knee_gap_uncertainty.estimator import GapEstimator
-from knee_gap_uncertainty.uncertainty_core import UncertaintyCore
+from knee_gap_uncertainty.estimation import uncertainty_core
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.uncertainty_core import UncertaintyCore
 
 _LOG = logging.getLogger(__name__)
 

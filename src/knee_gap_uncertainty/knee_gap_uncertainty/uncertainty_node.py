@@ -10,12 +10,18 @@ from rclpy.clock import Clock, ClockType
 
 from knee_gap_core.node.base_node import run
 from knee_gap_core.node.wired_node import WiredNode, blank
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.uncertainty_core import (
+    GAP_EDGES,
+    NODE,
+    SCOPE_POSE,
+    SCOPE_ROTATION,
+    UncertaintyCore,
+)
+from knee_gap_uncertainty.estimation.warm_up import warm_up
 from knee_gap_uncertainty.inputs.delays import ContinuedClock
 from knee_gap_uncertainty.inputs.message_sequence import MessageSequence
 from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
-from knee_gap_uncertainty.uncertainty_core import GAP_EDGES, NODE, SCOPE_POSE, SCOPE_ROTATION, UncertaintyCore
-from knee_gap_uncertainty.warm_up import warm_up
 
 # How often time is let pass when no message does it [s].
 TICK = 0.02

@@ -15,8 +15,8 @@ from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty import messages
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation import messages
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer
 

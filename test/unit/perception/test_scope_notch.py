@@ -33,7 +33,7 @@ from knee_gap_perception.scope_rotation.notch_tracker import (
 )
 from knee_gap_perception.scope_rotation.rotated_poses import NO_POSES
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
-from knee_gap_uncertainty.messages import rotation_from_message
+from knee_gap_uncertainty.estimation.messages import rotation_from_message
 
 SHAPE = NotchShape(0.047, 0.0597)
 HEIGHT, WIDTH = 360, 640

@@ -17,7 +17,7 @@ from knee_gap_replay.report.comparison import EDGES, GAP, Comparison, compare
 from knee_gap_simulation.make_bag.command import Recording, make_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth
-from knee_gap_uncertainty.messages import fill_gap_estimate
+from knee_gap_uncertainty.estimation.messages import fill_gap_estimate
 
 TRACK = 4
 

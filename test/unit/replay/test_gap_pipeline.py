@@ -23,9 +23,9 @@ from knee_gap_perception.trackers.scope_feed import ScopeFeed
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process
 from knee_gap_replay.topics import InputTopics
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.uncertainty_core import UncertaintyCore
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.uncertainty_core import UncertaintyCore
 
 EXACT = EstimatorParameters(**EXACT_SCOPE)
 

@@ -28,8 +28,8 @@ from knee_gap_simulation.recordings.scene_truth import SceneTruth
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.arthroscope import Scope
 from knee_gap_simulation.scope.lens import Lens
-from knee_gap_uncertainty.acceptance import Reason
-from knee_gap_uncertainty.messages import fill_gap_estimate
+from knee_gap_uncertainty.estimation.acceptance import Reason
+from knee_gap_uncertainty.estimation.messages import fill_gap_estimate
 
 BEGIN, PERIOD = 5_000_000_000, 20_000_000
 COUNT = 40

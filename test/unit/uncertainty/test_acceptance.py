@@ -11,8 +11,8 @@ from travelling_scope import TINY, travelling
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.acceptance import RULES, Facts, Kept, Reason, judge
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.acceptance import RULES, Facts, Kept, Reason, judge
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.multi_view.views import bearing_covariances
 
 FRAME_NS = 16_666_667

@@ -8,7 +8,7 @@ from test_joint_motion import EXACT, POINTS, observe
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.joint_motion.joint_motion import LARGEST_CREEP
 from knee_gap_uncertainty.joint_motion.motion_statistics import (

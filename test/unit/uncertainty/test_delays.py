@@ -6,7 +6,7 @@ import numpy as np
 from travelling_scope import TINY, travelling
 
 from knee_gap_core.values.gap_estimate import GapStatus
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.inputs.delays import ContinuedClock, DelayFloor
 
 MS = 1_000_000

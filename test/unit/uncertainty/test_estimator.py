@@ -12,7 +12,7 @@ from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import PoseRefusal
 from knee_gap_uncertainty.two_view.gap_range import gap_range

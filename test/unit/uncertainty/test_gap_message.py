@@ -7,8 +7,8 @@ import numpy as np
 from knee_gap_core.bag.message_types import blank
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rejection import Rejection
-from knee_gap_uncertainty.acceptance import Reason
-from knee_gap_uncertainty.messages import SHARES, fill_gap_estimate
+from knee_gap_uncertainty.estimation.acceptance import Reason
+from knee_gap_uncertainty.estimation.messages import SHARES, fill_gap_estimate
 
 NUMBERS = [field.name for field in fields(GapEstimate) if field.type is float]
 

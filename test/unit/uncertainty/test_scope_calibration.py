@@ -11,7 +11,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit
 from knee_gap_uncertainty.multi_view.views import bearing_covariances
@@ -195,7 +195,7 @@ def test_what_cannot_be_calculated_with_is_a_status(monkeypatch: pytest.MonkeyPa
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr("knee_gap_uncertainty.gap_track.explained_by", singular)
+    monkeypatch.setattr("knee_gap_uncertainty.estimation.gap_track.explained_by", singular)
     found = estimates(reported("tracking_node", "a" * 64, error=GOOD))
     assert {one.status for one in found} == {GapStatus.UNKNOWN}
     assert "unusable numbers" in found[-1].reason

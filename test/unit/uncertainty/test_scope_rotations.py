@@ -10,7 +10,7 @@ from travelling_scope import POINTS, estimates, observed, reported, scope, sprea
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.scope_rotations import RotationRefusal, ScopeRotation, ScopeRotations
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit

@@ -6,11 +6,11 @@ import sys
 from sample_bag import SAMPLE
 
 from knee_gap_core.values.gap_estimate import GapStatus
-from knee_gap_uncertainty.warm_up import warm_up
+from knee_gap_uncertainty.estimation.warm_up import warm_up
 
 COUNT_LATE = """
 import numba.core.dispatcher as dispatcher
-from knee_gap_uncertainty.warm_up import warm_up
+from knee_gap_uncertainty.estimation.warm_up import warm_up
 warm_up()
 late = []
 original = dispatcher.Dispatcher.compile

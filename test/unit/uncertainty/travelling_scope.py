@@ -9,7 +9,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation
 from knee_gap_uncertainty.multi_view.maximum_likelihood import fit

@@ -17,9 +17,9 @@ from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_simulation.knee_views import ViewErrors
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.messages import fill_gap_estimate
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
-from knee_gap_uncertainty.messages import fill_gap_estimate
 
 # The simulated clock at the start [s]; how long before a tick an image is exposed [s], so that its stamp is
 # that of no other event; and after how many ticks more its edges arrive.

@@ -11,7 +11,7 @@ from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_replay.report import figures
 from knee_gap_replay.report.frames import Frame
 from knee_gap_replay.report.results import Floats, Results, status_name
-from knee_gap_uncertainty.messages import SHARES
+from knee_gap_uncertainty.estimation.messages import SHARES
 
 MOST_DROPOUTS = 40
 _STYLE = """

@@ -15,7 +15,7 @@ from knee_gap_core.bag.errors import BagError
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_core.values.stamps import NANOSECONDS, stamp_ns
-from knee_gap_uncertainty.messages import NUMBERS, SHARES
+from knee_gap_uncertainty.estimation.messages import NUMBERS, SHARES
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.multi_view.views import Views, bearing_covariances, isotropic_covariances
 from knee_gap_uncertainty.scope_calibration.scope_calibration import ScopeCalibration

@@ -12,7 +12,7 @@ from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.errors import BaselineTooShortError, MeasurementError
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.acceptance import Facts, Kept, judge
+from knee_gap_uncertainty.estimation.acceptance import Facts, Kept, judge
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile, gap_profile
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (

@@ -11,7 +11,7 @@ import numpy as np
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_core.values.poses import LensPose
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.joint_motion import motion_statistics
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
 from knee_gap_uncertainty.multi_view import maximum_likelihood as multi_view

@@ -16,9 +16,9 @@ from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import NANOSECONDS
-from knee_gap_uncertainty.acceptance import Facts, Verdict, judge
+from knee_gap_uncertainty.estimation.acceptance import Facts, Verdict, judge
+from knee_gap_uncertainty.estimation.gap_track import Track
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
-from knee_gap_uncertainty.gap_track import Track
 from knee_gap_uncertainty.inputs.delays import DelayFloor
 from knee_gap_uncertainty.inputs.leg_body import LegBody
 from knee_gap_uncertainty.inputs.pose_buffer import PoseBuffer, PoseRefusal

@@ -10,9 +10,9 @@ from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.stamps import NANOSECONDS
-from knee_gap_uncertainty import messages
-from knee_gap_uncertainty.acceptance import Reason
-from knee_gap_uncertainty.estimator import GapEstimator
+from knee_gap_uncertainty.estimation import messages
+from knee_gap_uncertainty.estimation.acceptance import Reason
+from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
 from knee_gap_uncertainty.motion_advice.motion_advice import AdviceParameters
