@@ -28,7 +28,8 @@ from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.pose_messages import fill_lens_pose, lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
-from knee_gap_perception.camera.models import FisheyeCamera, bearing_jacobian
+from knee_gap_perception.camera.camera import bearing_jacobian
+from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import KneeSimulator, SimulatorFrame

@@ -22,9 +22,11 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 from knee_gap_perception.camera.camera_errors import WINDOW_TILT, CameraErrors, pupil_shift
+from knee_gap_perception.camera.camera_info import camera_from_info
 from knee_gap_perception.camera.medium import AIR, SALINE
-from knee_gap_perception.camera.models import Camera, bearing_jacobian, camera_from_info, camera_in_medium
+from knee_gap_perception.camera.refraction import camera_in_medium
 from knee_gap_simulation.recordings.recording import camera_info_message
 from knee_gap_simulation.scope.lens import Lens
 from knee_gap_uncertainty.estimation.estimator import GapEstimator

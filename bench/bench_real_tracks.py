@@ -27,7 +27,8 @@ from scipy.spatial.transform import Rotation
 from knee_gap_core.values.arrays import Array, Image
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_core.values.poses import LensPose, rigid_transform
-from knee_gap_perception.camera.models import Camera, PinholeCamera
+from knee_gap_perception.camera.camera import Camera
+from knee_gap_perception.camera.models import PinholeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.point_tracking.point_tracker import PointTracker
 from knee_gap_perception.point_tracking.tangent_plane import View

@@ -27,7 +27,8 @@ from tqdm import tqdm
 
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import EdgeStatus
-from knee_gap_perception.camera.models import Camera, FisheyeCamera
+from knee_gap_perception.camera.camera import Camera
+from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.segmentation.choice import WITHOUT_NETWORK

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_core.values.pose_interpolation import LensPosePredictor
 from knee_gap_core.values.poses import BodyPose, LensPose
-from knee_gap_perception.camera.models import camera_from_info
+from knee_gap_perception.camera.camera_info import camera_from_info
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.errors import PerceptionError

@@ -6,14 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from knee_gap_perception.camera.models import (
-    Camera,
-    EquiangularCamera,
-    FisheyeCamera,
-    PinholeCamera,
-    bearing_jacobian,
-    camera_from_info,
-)
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
+from knee_gap_perception.camera.camera_info import camera_from_info
+from knee_gap_perception.camera.models import EquiangularCamera, FisheyeCamera, PinholeCamera
 from knee_gap_perception.errors import PerceptionError
 
 MATRIX = (900.0, 905.0, 645.0, 352.0)

@@ -11,19 +11,13 @@ from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.calibration.calibration_file import load_calibration, save_calibration
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.bearing_errors import BearingErrors
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 from knee_gap_perception.camera.camera_errors import MOST_ERRORS, NEAR, PUPIL_DEPTH, CameraErrors, pupil_shift
+from knee_gap_perception.camera.camera_info import camera_from_info
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.camera.medium import AIR, SALINE, WATER, Medium, medium_of
-from knee_gap_perception.camera.models import (
-    Camera,
-    EquiangularCamera,
-    FisheyeCamera,
-    PinholeCamera,
-    RefractedCamera,
-    bearing_jacobian,
-    camera_from_info,
-    camera_in_medium,
-)
+from knee_gap_perception.camera.models import EquiangularCamera, FisheyeCamera, PinholeCamera
+from knee_gap_perception.camera.refraction import RefractedCamera, camera_in_medium
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import CameraInfoParameters
 from knee_gap_perception.errors import PerceptionError

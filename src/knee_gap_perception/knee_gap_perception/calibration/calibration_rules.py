@@ -4,8 +4,8 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_perception.calibration.calibration import Calibration, LensOnBody, Oblique
+from knee_gap_perception.camera.camera_info import MODELS
 from knee_gap_perception.camera.intrinsics import Intrinsics
-from knee_gap_perception.camera.models import MODELS
 
 # The largest image that is read [px], and the largest offset that calibration looks for [s].
 MOST_PX = 16_384

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.camera.camera import Camera
 
 # Half a degree [rad]: 4 px of a usual scope, far beyond the errors of a calibration.
 NOTABLE = np.radians(0.5)

@@ -10,8 +10,9 @@ from typing import Protocol
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.camera.medium import Medium
-from knee_gap_perception.camera.models import Camera, camera_in_medium, refracted
+from knee_gap_perception.camera.refraction import camera_in_medium, refracted
 
 MOST_ERRORS = 9  # independent errors that knee_gap_msgs/GapEdges holds
 # Standard deviations of the window's tilt about each image axis [rad] (windows are cemented to some tenths of

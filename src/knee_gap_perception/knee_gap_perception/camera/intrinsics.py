@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from knee_gap_core.values.arrays import Array
-from knee_gap_perception.camera.models import MODELS, Camera
+from knee_gap_perception.camera.camera import Camera
+from knee_gap_perception.camera.camera_info import MODELS
 
 
 @dataclass(frozen=True)

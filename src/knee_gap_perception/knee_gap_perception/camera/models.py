@@ -4,115 +4,29 @@ Pixels are (column, row), (0, 0) the centre of the first pixel. The optical fram
 view, x to the right, y down. A pixel or direction outside the model gives NaN.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_perception.camera.camera import (
+    Coarseness,
+    check_matrix,
+    check_size,
+    coefficients,
+    first_positive_root,
+)
 from knee_gap_perception.camera.fisheye_kernel import fisheye_bearings, fisheye_pixels
 from knee_gap_perception.errors import PerceptionError
 
-# Largest coefficient, focal length and centre [-, px]: larger ones are not plausible, and products overflow.
-LARGEST_NUMBER = 1e6
-SHORTEST_FOCAL = 1e-3  # [px]
 PIXEL_TOLERANCE = 1e-6  # [px] largest change of a pixel after conversion to a direction and back
-NO_TERM = 1e-30  # [-] relative to a polynomial's largest term: smaller terms are ignored
 TABLE_SIZE = 2048  # samples of a distortion curve, from which its inverse starts
 
 
-class Camera(Protocol):
-    """Interface of a camera model."""
-
-    @property
-    def width_px(self) -> int:
-        """Columns of the image."""
-
-    @property
-    def height_px(self) -> int:
-        """Rows of the image."""
-
-    def bearings(self, pixels: npt.ArrayLike) -> Array:
-        """Unit vectors (..., 3) seen at pixels (..., 2); NaN outside the model."""
-
-    def pixels(self, bearings: npt.ArrayLike) -> Array:
-        """Pixels (..., 2) at which directions (..., 3) of any length are seen; NaN outside the model."""
-
-    def radians_per_pixel(self, pixel: npt.ArrayLike) -> float:
-        """Angle [rad] that one pixel spans at a pixel (2,), along the coarser direction; NaN outside."""
-
-
-def bearing_jacobian(camera: Camera, pixel: npt.ArrayLike) -> Array:
-    """Change of the bearing with the pixel (3, 2) [1/px] at a pixel (2,), by central differences."""
-    u, v = np.asarray(pixel, dtype=np.float64)
-    step = 0.25
-    b = camera.bearings([[u + step, v], [u - step, v], [u, v + step], [u, v - step]])
-    jacobian: Array = np.stack([b[0] - b[1], b[2] - b[3]], axis=1) / (2 * step)
-    return jacobian
-
-
-class _Coarseness:
-    """Angle spanned by a pixel, computed in the same way for every model."""
-
-    def radians_per_pixel(self: Camera, pixel: npt.ArrayLike) -> float:
-        """Angle [rad] that one pixel spans at a pixel (2,), along the coarser direction; NaN outside."""
-        jacobian = bearing_jacobian(self, pixel)
-        if not np.isfinite(jacobian).all():
-            return float("nan")
-        # The larger singular value of a matrix (3, 2), without the price of a decomposition.
-        (a, b), (_, c) = (jacobian.T @ jacobian).tolist()
-        return float(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
-
-
-def _check_size(width_px: int, height_px: int) -> None:
-    if width_px < 1 or height_px < 1:
-        raise PerceptionError(f"an image must have at least 1x1 px, not {width_px}x{height_px} px")
-
-
-def _check_matrix(fx: float, fy: float, cx: float, cy: float) -> None:
-    if not np.isfinite([fx, fy, cx, cy]).all():
-        raise PerceptionError(f"the camera matrix must be finite, not fx={fx}, fy={fy}, cx={cx}, cy={cy} px")
-    if fx <= 0 or fy <= 0:
-        raise PerceptionError(
-            f"focal lengths must be above 0 px, not fx={fx}, fy={fy} px (0 stands for an uncalibrated camera)"
-        )
-    if min(fx, fy) < SHORTEST_FOCAL or max(np.abs([fx, fy, cx, cy])) > LARGEST_NUMBER:
-        raise PerceptionError(
-            f"the camera matrix must hold focal lengths in [{SHORTEST_FOCAL:g}, {LARGEST_NUMBER:g}] px and a "
-            f"centre within {LARGEST_NUMBER:g} px, not fx={fx}, fy={fy}, cx={cx}, cy={cy} px"
-        )
-
-
-def _coefficients(distortion: Sequence[float], allowed: tuple[int, ...], model: str) -> tuple[float, ...]:
-    values = tuple(float(value) for value in distortion)
-    if len(values) not in allowed:
-        choices = ", ".join(map(str, allowed))
-        raise PerceptionError(f"{model} takes {choices} distortion coefficients, not {len(values)}")
-    if not np.isfinite(values).all():
-        raise PerceptionError(f"distortion coefficients must be finite, not {values}")
-    if any(abs(value) > LARGEST_NUMBER for value in values):
-        raise PerceptionError(
-            f"distortion coefficients must lie within {LARGEST_NUMBER:g} of 0, not {values}"
-        )
-    return values
-
-
-def _first_positive_root(coefficients: npt.ArrayLike, limit: float) -> float:
-    """Smallest positive real root of a polynomial, highest power first; `limit` if none is below it."""
-    polynomial = np.asarray(coefficients, dtype=np.float64)
-    # A term that has no effect below the limit is left out: its roots would overflow.
-    terms = np.abs(polynomial) * limit ** np.arange(len(polynomial) - 1, -1, -1)
-    polynomial = np.where(terms > NO_TERM * terms.max(), polynomial, 0.0)
-    roots = np.roots(polynomial)
-    real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
-    return float(min(real.min(initial=limit), limit))
-
-
 @dataclass(frozen=True)
-class EquiangularCamera(_Coarseness):
+class EquiangularCamera(Coarseness):
     """The paper's model: every pixel spans the same angle, its degrees per pixel DPP (section II-E).
 
     Columns count azimuth about the y axis, rows elevation from the x-z plane:
@@ -128,7 +42,7 @@ class EquiangularCamera(_Coarseness):
     field_elevation: float = np.pi / 2
 
     def __post_init__(self) -> None:
-        _check_size(self.width_px, self.height_px)
+        check_size(self.width_px, self.height_px)
         if not 0 < self.field_azimuth <= 2 * np.pi or not 0 < self.field_elevation <= np.pi:
             raise PerceptionError(
                 "the field of view must lie in (0, 2 pi] rad in azimuth and (0, pi] rad in elevation, "
@@ -164,7 +78,7 @@ class EquiangularCamera(_Coarseness):
 
 
 @dataclass(frozen=True)
-class PinholeCamera(_Coarseness):
+class PinholeCamera(Coarseness):
     """OpenCV's pinhole model, CameraInfo's `plumb_bob` and `rational_polynomial`.
 
     It takes no, 4, 5 or 8 distortion coefficients, or 12 with the thin prism. Directions at or behind the
@@ -183,9 +97,9 @@ class PinholeCamera(_Coarseness):
     fold_radius: float = field(init=False, repr=False, default=np.inf)
 
     def __post_init__(self) -> None:
-        _check_size(self.width_px, self.height_px)
-        _check_matrix(self.fx, self.fy, self.cx, self.cy)
-        given = _coefficients(self.distortion, (0, 4, 5, 8, 12), "the pinhole model")
+        check_size(self.width_px, self.height_px)
+        check_matrix(self.fx, self.fy, self.cx, self.cy)
+        given = coefficients(self.distortion, (0, 4, 5, 8, 12), "the pinhole model")
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = given + (0.0,) * (12 - len(given))
         object.__setattr__(self, "distortion", given)
         object.__setattr__(self, "_numerator", np.array([k3, 0, k2, 0, k1, 0, 1]))
@@ -203,8 +117,8 @@ class PinholeCamera(_Coarseness):
         slope = np.polysub(
             np.polymul(np.polyder(curve), self._denominator), np.polymul(curve, np.polyder(self._denominator))
         )
-        limit = _first_positive_root(self._denominator, limit=20.0)
-        return _first_positive_root(slope, limit=limit)
+        limit = first_positive_root(self._denominator, limit=20.0)
+        return first_positive_root(slope, limit=limit)
 
     def _radial(self, r: Array) -> Array:
         return np.asarray(np.polyval(self._numerator, r) / np.polyval(self._denominator, r))
@@ -268,7 +182,7 @@ class PinholeCamera(_Coarseness):
 
 
 @dataclass(frozen=True)
-class FisheyeCamera(_Coarseness):
+class FisheyeCamera(Coarseness):
     """OpenCV's fisheye (Kannala-Brandt) model, CameraInfo's `equidistant`.
 
     The radius in the image is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), theta the angle
@@ -288,13 +202,13 @@ class FisheyeCamera(_Coarseness):
     fold_angle: float = field(init=False, repr=False, default=np.pi)
 
     def __post_init__(self) -> None:
-        _check_size(self.width_px, self.height_px)
-        _check_matrix(self.fx, self.fy, self.cx, self.cy)
-        given = _coefficients(self.distortion, (4,), "the fisheye model")
+        check_size(self.width_px, self.height_px)
+        check_matrix(self.fx, self.fy, self.cx, self.cy)
+        given = coefficients(self.distortion, (4,), "the fisheye model")
         k1, k2, k3, k4 = given
         object.__setattr__(self, "distortion", given)
         slope = [9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1]
-        object.__setattr__(self, "fold_angle", _first_positive_root(slope, limit=np.pi))
+        object.__setattr__(self, "fold_angle", first_positive_root(slope, limit=np.pi))
 
     def _radius(self, theta: Array) -> Array:
         k1, k2, k3, k4 = self.distortion
@@ -331,106 +245,3 @@ class FisheyeCamera(_Coarseness):
         flat = np.ascontiguousarray(given.reshape(-1, 3))
         found = fisheye_pixels(flat, self._matrix, self._polynomial, self.fold_angle)
         return found.reshape((*given.shape[:-1], 2))
-
-
-def refracted(bearings: npt.ArrayLike, index_ratio: float) -> Array:
-    """Unit vectors (..., 3) after a window across the z axis of rays along directions (..., 3) of any length.
-
-    `index_ratio` is the sine of the angle after the window to that before it. NaN for directions along or
-    against the window and for rays that it reflects totally.
-    """
-    ray = np.asarray(bearings, dtype=np.float64)
-    length = np.linalg.norm(ray, axis=-1, keepdims=True)
-    side = index_ratio * ray[..., :2] / np.where(length > 0, length, np.nan)
-    square = 1.0 - (side * side).sum(axis=-1, keepdims=True)
-    passes = (square > 0) & (ray[..., 2:] > 0)
-    ahead = np.sqrt(np.where(passes, square, np.nan))
-    return np.concatenate([np.where(passes, side, np.nan), ahead], axis=-1)
-
-
-@dataclass(frozen=True)
-class RefractedCamera(_Coarseness):
-    """A camera of any model, calibrated in one medium and used in another, behind a flat window.
-
-    The window is perpendicular to the view, and the pupil close behind it: a pixel keeps its azimuth about
-    the z axis, and sin(angle in use) = `index_ratio` * sin(angle of `camera`), with the ratio of the
-    refractive indices n_calibration / n_use. Rays that meet no window, or that it reflects totally, are
-    outside the model. Raises PerceptionError for a ratio that is not a positive number.
-    """
-
-    camera: Camera
-    index_ratio: float
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.index_ratio < np.inf:
-            raise PerceptionError(
-                f"the ratio of refractive indices must be above 0 and finite, not {self.index_ratio}"
-            )
-
-    @property
-    def width_px(self) -> int:
-        """Columns of the image."""
-        return self.camera.width_px
-
-    @property
-    def height_px(self) -> int:
-        """Rows of the image."""
-        return self.camera.height_px
-
-    def bearings(self, pixels: npt.ArrayLike) -> Array:
-        """Unit vectors (..., 3) in use seen at pixels (..., 2); NaN outside the model."""
-        return refracted(self.camera.bearings(pixels), self.index_ratio)
-
-    def pixels(self, bearings: npt.ArrayLike) -> Array:
-        """Pixels (..., 2) at which directions (..., 3) in use are seen; NaN outside the model."""
-        return self.camera.pixels(refracted(bearings, 1.0 / self.index_ratio))
-
-
-def camera_in_medium(camera: Camera, index_ratio: float) -> Camera:
-    """The camera with the sines of all angles multiplied by `index_ratio`; itself for 1."""
-    return camera if index_ratio == 1.0 else RefractedCamera(camera, index_ratio)
-
-
-class CameraInfo(Protocol):
-    """The fields of sensor_msgs/CameraInfo that are used, of ROS's own class or any other."""
-
-    height: int
-    width: int
-    distortion_model: str
-    d: Sequence[float]
-    k: Sequence[float]
-
-
-MODELS: dict[str, Callable[..., Camera]] = {
-    "plumb_bob": PinholeCamera,
-    "rational_polynomial": PinholeCamera,
-    "equidistant": FisheyeCamera,
-    "fisheye": FisheyeCamera,
-}
-
-
-def camera_from_info(info: CameraInfo) -> Camera:
-    """The camera that a sensor_msgs/CameraInfo describes.
-
-    Raises PerceptionError for an unknown distortion model, an uncalibrated camera, and binned or cropped
-    images.
-    """
-    if info.distortion_model not in MODELS:
-        choices = ", ".join(MODELS)
-        raise PerceptionError(
-            f"camera_info's distortion_model must be one of {choices}, not '{info.distortion_model}'"
-        )
-    if max(getattr(info, "binning_x", 0), getattr(info, "binning_y", 0)) > 1:
-        raise PerceptionError(f"camera_info must not be binned, but has {info.binning_x}x{info.binning_y}")  # type: ignore[attr-defined]
-    roi = getattr(info, "roi", None)
-    if roi is not None and (roi.x_offset, roi.y_offset) != (0, 0):
-        raise PerceptionError(
-            "camera_info must describe the whole image, but its region of interest starts at "
-            f"({roi.x_offset}, {roi.y_offset}) px"
-        )
-    k = np.asarray(info.k, dtype=np.float64)
-    if k.shape != (9,):
-        raise PerceptionError(f"camera_info's k must have 9 entries, not {k.size}")
-    fx, fy, cx, cy = float(k[0]), float(k[4]), float(k[2]), float(k[5])
-    model = MODELS[info.distortion_model]
-    return model(int(info.width), int(info.height), fx, fy, cx, cy, tuple(float(value) for value in info.d))

@@ -19,9 +19,11 @@ from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.camera.agreement import disagreement
 from knee_gap_perception.camera.bearing_errors import BearingErrors
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.camera.camera_errors import CameraErrors, ErrorSource
+from knee_gap_perception.camera.camera_info import camera_from_info
 from knee_gap_perception.camera.medium import AIR, SALINE, Medium
-from knee_gap_perception.camera.models import Camera, camera_from_info, camera_in_medium
+from knee_gap_perception.camera.refraction import camera_in_medium
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_perception.edge_tracking.overlay import draw_overlay
 from knee_gap_perception.edge_tracking.parameters import PoseParameters

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.poses import LensPose
-from knee_gap_perception.camera.models import Camera, bearing_jacobian
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.gap_detection.gap_detector import Found, GapSearch, NoPointsError, check_light

@@ -5,7 +5,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array, Image
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
-from knee_gap_perception.camera.models import Camera, bearing_jacobian
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 
 POINT_COLOURS = ((80, 200, 255), (255, 170, 60))  # blue, green, red of G0 and G1
 SECTION_COLOUR = (240, 240, 240)

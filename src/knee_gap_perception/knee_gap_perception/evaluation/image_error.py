@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from knee_gap_core.values.arrays import Array, Mask
-from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.errors import PerceptionError
 
 DIRECTIONS = 180

@@ -8,7 +8,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_core.values.edges import EdgeStatus
-from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.gap_detection.confidence import gap_confidence
 from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
 from knee_gap_perception.gap_detection.cross_section import Section, find_section

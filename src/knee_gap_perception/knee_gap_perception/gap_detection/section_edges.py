@@ -13,7 +13,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array, Image, Mask
 from knee_gap_core.values.edges import EdgeState, SectionEdges
-from knee_gap_perception.camera.models import Camera, bearing_jacobian
+from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 from knee_gap_perception.gap_detection.section_kernel import circle_between, last_below
 from knee_gap_perception.image.field_of_view import FieldOfView
 

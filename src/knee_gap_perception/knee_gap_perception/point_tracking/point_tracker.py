@@ -16,7 +16,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array, Image
 from knee_gap_core.values.edges import EdgeKind
-from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.point_tracking.patch_registration import (
     Patch,
     Registration,

@@ -11,7 +11,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.poses import LensPose
-from knee_gap_perception.camera.models import Camera
+from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.point_tracking.patch_registration import Warp
 
 TYPICAL_DISTANCE = 0.012  # [m] from lens to tissue in a joint

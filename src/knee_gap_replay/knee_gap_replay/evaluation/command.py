@@ -18,7 +18,9 @@ from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.errors import KneeGapError
 from knee_gap_perception.calibrate.bag_input import CalibrationBag
 from knee_gap_perception.calibration.calibration_file import load_calibration
-from knee_gap_perception.camera.models import Camera, EquiangularCamera, camera_from_info
+from knee_gap_perception.camera.camera import Camera
+from knee_gap_perception.camera.camera_info import camera_from_info
+from knee_gap_perception.camera.models import EquiangularCamera
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.evaluation.difference_picture import difference_picture, panel
 from knee_gap_perception.evaluation.image_error import EdgeError, Overlap, edge_error, overlap, rms

@@ -9,6 +9,7 @@ from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.knee.scene import NO_PROBE, KneeScene
 from knee_gap_simulation.surfaces import distance_field as fields
+from knee_gap_simulation.surfaces import ray_marching as rays
 
 Bytes = npt.NDArray[np.uint8]
 NOTHING = np.uint8(255)
@@ -52,7 +53,7 @@ class SurfaceMapper:
         origin, turn = np.ascontiguousarray(T_scene_lens[:3, 3]), T_scene_lens[:3, :3]
         free = np.empty(len(self._cones))
         directions = np.ascontiguousarray(self._cones @ turn.T)
-        fields.free_lengths(origin, directions, self._spread, self._constants, self._waves, rods, free)
+        rays.free_lengths(origin, directions, self._spread, self._constants, self._waves, rods, free)
         coarse = self._trace(origin, self._coarse.reshape(-1, 3) @ turn.T, free[self._cone_of], lamp, rods)
         grid = self._coarse.shape[:2]
         facing = -np.einsum("ijk,ijk->ij", coarse[2].reshape(*grid, 3), self._coarse @ turn.T)
@@ -93,11 +94,9 @@ class SurfaceMapper:
         lengths, surfaces = np.empty(count), np.empty(count, np.uint8)
         normals, reach = np.empty((count, 3)), np.empty((count, 2))
         knee = self._constants, self._waves, probe
-        fields.cast(
-            origin, np.ascontiguousarray(directions), starts, False, *knee, lengths, surfaces, normals
-        )
+        rays.cast(origin, np.ascontiguousarray(directions), starts, False, *knee, lengths, surfaces, normals)
         points = origin + lengths[:, None] * directions
-        fields.light_reach(points, normals, lamp, *knee, reach)
+        rays.light_reach(points, normals, lamp, *knee, reach)
         return lengths, surfaces, normals, reach
 
 

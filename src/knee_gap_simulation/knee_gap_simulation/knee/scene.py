@@ -16,6 +16,7 @@ from scipy.optimize import minimize_scalar
 from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.surfaces import distance_field as fields
+from knee_gap_simulation.surfaces import ray_marching as rays
 from knee_gap_simulation.surfaces.distance_field import CAPSULE, CONDYLE, MENISCUS, PLATEAU, PROBE
 from knee_gap_simulation.surfaces.tissue_samples import TissueSamples, angles_off, knee_samples
 
@@ -176,7 +177,7 @@ class KneeScene:
         count = len(directions)
         lengths, normals = np.empty(count), np.empty((count, 3))
         surfaces = np.empty(count, np.uint8)
-        fields.cast(
+        rays.cast(
             np.ascontiguousarray(origin),
             np.ascontiguousarray(directions),
             np.zeros(count) if starts is None else starts,

@@ -12,7 +12,8 @@ from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee.shape import KneeShape
 from knee_gap_simulation.rims.scene import RimScene
 from knee_gap_simulation.scope.lens import Lens
-from knee_gap_simulation.surfaces.instrument_gap import CONE, InstrumentGap, TissuePoints, instrument_gap
+from knee_gap_simulation.surfaces.instrument_gap import CONE, InstrumentGap, instrument_gap
+from knee_gap_simulation.surfaces.tissue_points import TissuePoints
 from knee_gap_simulation.surfaces.tissue_samples import LOWER_SIDE, UPPER_SIDE, TissueSamples
 
 Scene = RimScene | KneeShape

@@ -16,20 +16,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
 from knee_gap_simulation.errors import SimulationError
-
-IntArray = npt.NDArray[np.int64]
+from knee_gap_simulation.surfaces.linear_programme import highest
+from knee_gap_simulation.surfaces.tissue_points import Extent, TissuePoints, free_radius, nearest_points, scan
 
 # Half angle of the cone about the direction of view that contains the instrument's direction [rad].
 CONE = float(np.radians(10.0))
 # Length along the axis before and behind the section over which the instrument touches no tissue [m].
 REACH = 0.010
 
-_BLOCK = 1.0e-3  # edge [m] of the cubes into which points are sorted
-_CROSSINGS = 11  # positions of the axis on the section in the scan
-_CROSSING_STEP = 1e-6  # [m]: accuracy of each tilt's best position
 _RINGS = 6  # rings of tilts in the scan
 _STARTS = 5  # maxima of the scan that are followed
 _LEVER = 5.0e-3  # [m]: a tilt counts as much as a shift of the axis at this distance
@@ -37,7 +33,6 @@ _TRUST = 0.4e-3  # initial trust region [m]
 _LEAST_TRUST = 2e-8  # trust region [m] at which the search stops
 _ROUNDS = 60
 _TANGENTS = 24  # of the cone, in the linear programme
-_MOST_POINTS = 1500  # in the linear programme
 
 
 class InstrumentGap(NamedTuple):
@@ -54,57 +49,6 @@ class InstrumentGap(NamedTuple):
         """The same instrument, of frame b, in frame a."""
         turn = T_a_b[:3, :3]
         return InstrumentGap(self.diameter, turn @ self.axis_point + T_a_b[:3, 3], turn @ self.axis_direction)
-
-
-class TissuePoints(NamedTuple):
-    """Points (n, 3) [m] sorted into blocks: block k holds ``starts[k]`` to ``starts[k + 1]``.
-
-    ``centres`` (m, 3) and ``radii`` (m,) are of spheres around the blocks.
-    """
-
-    points: Array
-    starts: IntArray
-    centres: Array
-    radii: Array
-
-    @staticmethod
-    def of(points: npt.ArrayLike) -> "TissuePoints":
-        """Sort points (n, 3) [m] into blocks. Raises SimulationError unless they are finite."""
-        values = np.asarray(points, dtype=np.float64)
-        if values.ndim != 2 or values.shape[1] != 3 or not len(values) or not np.isfinite(values).all():
-            raise SimulationError(f"points of tissue must be finite and (n, 3), not of shape {values.shape}")
-        cells = np.floor((values - values.min(axis=0)) / _BLOCK).astype(np.int64)
-        counts = cells.max(axis=0) + 1
-        keys = (cells[:, 0] * counts[1] + cells[:, 1]) * counts[2] + cells[:, 2]
-        order = np.argsort(keys, kind="stable")
-        starts = np.concatenate([[0], np.flatnonzero(np.diff(keys[order])) + 1])
-        ordered = values[order]
-        low = np.minimum.reduceat(ordered, starts)
-        high = np.maximum.reduceat(ordered, starts)
-        radii = 0.5 * np.linalg.norm(high - low, axis=1) + 1e-9
-        return TissuePoints(ordered, np.append(starts, len(values)), 0.5 * (low + high), radii)
-
-    def around(self, point: Array, direction: Array, radius: float, reach: float) -> "TissuePoints":
-        """The blocks that a cylinder may touch, ``reach`` [m] before and behind a point (3,) of its axis."""
-        away = self.centres - point
-        along = away @ direction
-        aside = np.sqrt(np.maximum((away * away).sum(axis=1) - along * along, 0.0))
-        kept = np.flatnonzero((aside - self.radii <= radius) & (np.abs(along) - self.radii <= reach))
-        counts = np.diff(self.starts)[kept]
-        starts = np.append(0, np.cumsum(counts)).astype(np.int64)
-        index = np.repeat(self.starts[kept] - starts[:-1], counts) + np.arange(starts[-1])
-        return TissuePoints(self.points[index], starts, self.centres[kept], self.radii[kept])
-
-
-class _Extent(NamedTuple):
-    """Region in which tissue counts: within ``reach`` [m] of the section along an axis, not before the lens.
-
-    The lens is at a depth of ``lens`` [m] along the direction of view (3,).
-    """
-
-    reach: float
-    viewing: Array
-    lens: float
 
 
 def instrument_gap(
@@ -135,7 +79,7 @@ def instrument_gap(
         raise SimulationError(f"the cone must lie in [0, pi/3] rad, the reach in (0, 1) m: {cone}, {reach}")
     view = view / length
     depth = -np.inf if lens is None else float(view @ np.asarray(lens, dtype=np.float64))
-    search = _Search(points, edges, _Extent(reach, view, depth), cone)
+    search = _Search(points, edges, Extent(reach, view, depth), cone)
     best, place = max((search.refined(start) for start in search.scanned()), key=lambda found: found[0])
     crossing, direction = search.axis(place)
     return InstrumentGap(2.0 * best, crossing, direction)
@@ -147,7 +91,7 @@ class _Search:
     A place (3,) is the crossing's distance from the first edge [m], and two tilts times ``_LEVER`` [m].
     """
 
-    def __init__(self, tissue: TissuePoints, edges: Array, extent: _Extent, cone: float) -> None:
+    def __init__(self, tissue: TissuePoints, edges: Array, extent: Extent, cone: float) -> None:
         view = extent.viewing
         self._extent, self._start = extent, edges[0]
         self._width = float(np.linalg.norm(edges[1] - edges[0]))
@@ -185,7 +129,7 @@ class _Search:
         free: list[float] = []
         for tilt in np.concatenate(tilts):
             direction = self.axis(np.array([0.0, *tilt]))[1]
-            best, crossing = _scan(
+            best, crossing = scan(
                 self._tissue, self._start, self._across, self._width, direction, self._extent
             )
             places.append(np.array([crossing, *tilt]))
@@ -199,10 +143,10 @@ class _Search:
 
     def refined(self, place: Array) -> tuple[float, Array]:
         """Largest free radius [m] found from a starting place, and its place."""
-        best, trust = _free_radius(self._tissue, *self.axis(place), self._extent, 0.0), _TRUST
+        best, trust = free_radius(self._tissue, *self.axis(place), self._extent, 0.0), _TRUST
         for _ in range(_ROUNDS):
             proposed = self._proposed(place, best, trust)
-            free = _free_radius(self._tissue, *self.axis(proposed), self._extent, best)
+            free = free_radius(self._tissue, *self.axis(proposed), self._extent, best)
             if free > best:
                 trust = trust if free - best > 0.1 * trust else 0.5 * trust
                 best, place = free, proposed
@@ -215,7 +159,7 @@ class _Search:
     def _proposed(self, place: Array, free: float, trust: float) -> Array:
         """Best place within the trust region by the linearised distances."""
         crossing, direction = self.axis(place)
-        nearest = _nearest_points(self._tissue, crossing, direction, self._extent, free + 6.0 * trust)
+        nearest = nearest_points(self._tissue, crossing, direction, self._extent, free + 6.0 * trust)
         away = self._tissue.points[nearest] - crossing
         along = away @ direction
         aside = away - along[:, None] * direction
@@ -240,179 +184,9 @@ class _Search:
         room = np.maximum(self._most - tangents @ place[1:], 0.0)
         # In units of the trust region, so that tolerances mean the same in every round.
         limits = np.concatenate([high, -low, distances - free, room]) / trust
-        proposed = place + trust * _highest(rows, limits)[:3]
+        proposed = place + trust * highest(rows, limits)[:3]
         tilt = float(np.linalg.norm(proposed[1:]))
         if tilt > self._most:
             proposed[1:] *= self._most / tilt
         proposed[0] = min(max(proposed[0], 0.0), self._width)
         return np.asarray(proposed)
-
-
-@compiled(nogil=True)
-def _highest(rows: Array, limits: Array) -> Array:
-    """The x (4,) with the greatest x[3] of all with rows @ x <= limits, (m, 4) and (m,).
-
-    The first six rows must be the upper and the lower bounds of x[0] to x[2], the seventh must bound x[3].
-    The dual programme by the simplex method; a basis is four rows, which meet in x.
-    """
-    basis = np.array([0, 1, 2, 6])
-    inverse = np.eye(4)  # of the rows of the basis
-    for k in range(3):
-        # The bound against which the seventh row pushes.
-        if rows[6, k] > 0.0:
-            basis[k] = 3 + k
-            inverse[k, k] = -1.0
-        inverse[3, k] = -rows[6, k] * inverse[k, k]
-    x, change = np.zeros(4), np.zeros(4)
-    for _ in range(400):
-        for j in range(4):
-            x[j] = 0.0
-            for k in range(4):
-                x[j] += inverse[j, k] * limits[basis[k]]
-        entering, worst = -1, -1e-9
-        for i in range(rows.shape[0]):
-            room = limits[i]
-            for k in range(4):
-                room -= rows[i, k] * x[k]
-            if room < worst:
-                entering, worst = i, room
-        if entering < 0:
-            break
-        leaving, least = -1, np.inf
-        for k in range(4):
-            change[k] = 0.0
-            for j in range(4):
-                change[k] += inverse[j, k] * rows[entering, j]
-            if change[k] > 1e-12 and inverse[3, k] / change[k] < least:
-                leaving, least = k, inverse[3, k] / change[k]
-        if leaving < 0:
-            break
-        basis[leaving] = entering
-        for j in range(4):
-            inverse[j, leaving] /= change[leaving]
-            for k in range(4):
-                if k != leaving:
-                    inverse[j, k] -= inverse[j, leaving] * change[k]
-    return x
-
-
-@compiled(nogil=True)
-def _scan(
-    tissue: TissuePoints,
-    start: Array,
-    across: Array,
-    width: float,
-    direction: Array,
-    extent: _Extent,
-) -> tuple[float, float]:
-    """Largest free radius of parallel axes that cross the section, and the place of the crossing [m]."""
-    best, crossing = 0.0, 0.5 * width
-    for k in range(_CROSSINGS):
-        s = width * (k + 0.5) / _CROSSINGS
-        free = _free_radius(tissue, start + s * across, direction, extent, best)
-        if free > best:
-            best, crossing = free, s
-    # On one side the tissue above is nearest, on the other the tissue below: bisect for the best place.
-    step = width / _CROSSINGS
-    while step > _CROSSING_STEP:
-        step *= 0.5
-        for s in (crossing - step, crossing + step):
-            free = _free_radius(tissue, start + s * across, direction, extent, best)
-            if free > best:
-                best, crossing = free, s
-    return best, crossing
-
-
-@compiled(nogil=True)
-def _nearest_in_block(
-    tissue: TissuePoints, k: int, crossing: Array, direction: Array, extent: _Extent, best: float
-) -> tuple[float, int]:
-    """Least squared distance from the axis below ``best`` in a block, and the point; -1 for none."""
-    points, found = tissue.points, -1
-    for i in range(tissue.starts[k], tissue.starts[k + 1]):
-        x, y, z = points[i, 0] - crossing[0], points[i, 1] - crossing[1], points[i, 2] - crossing[2]
-        along = x * direction[0] + y * direction[1] + z * direction[2]
-        if abs(along) > extent.reach:
-            continue
-        # A difference of squares would lose half of the digits.
-        x, y, z = x - along * direction[0], y - along * direction[1], z - along * direction[2]
-        squared = x * x + y * y + z * z
-        if squared < best:
-            v = extent.viewing
-            if points[i, 0] * v[0] + points[i, 1] * v[1] + points[i, 2] * v[2] >= extent.lens:
-                best, found = squared, i
-    return best, found
-
-
-@compiled(nogil=True)
-def _room(tissue: TissuePoints, k: int, crossing: Array, direction: Array, reach: float) -> float:
-    """Lower bound of the distance of a block's points from the axis; infinite for a block out of reach."""
-    x = tissue.centres[k, 0] - crossing[0]
-    y = tissue.centres[k, 1] - crossing[1]
-    z = tissue.centres[k, 2] - crossing[2]
-    along = x * direction[0] + y * direction[1] + z * direction[2]
-    if abs(along) - tissue.radii[k] > reach:
-        return np.inf
-    return float(np.sqrt(max(0.0, x * x + y * y + z * z - along * along)) - tissue.radii[k])
-
-
-@compiled(nogil=True)
-def _free_radius(
-    tissue: TissuePoints, crossing: Array, direction: Array, extent: _Extent, floor: float
-) -> float:
-    """Distance of the nearest point from an axis; one below ``floor``, once found, ends the search."""
-    rooms = np.empty(len(tissue.radii))
-    for k in range(len(rooms)):
-        rooms[k] = _room(tissue, k, crossing, direction, extent.reach)
-    # The block that is likely to hold the nearest point comes first.
-    first = int(np.argmin(rooms))
-    best = _nearest_in_block(tissue, first, crossing, direction, extent, np.inf)[0]
-    for k in range(len(rooms)):
-        if best < floor * floor:
-            break
-        if k != first and (rooms[k] < 0.0 or rooms[k] * rooms[k] < best):
-            best = _nearest_in_block(tissue, k, crossing, direction, extent, best)[0]
-    return float(np.sqrt(best))
-
-
-@compiled(nogil=True)
-def _nearest_points(
-    tissue: TissuePoints, crossing: Array, direction: Array, extent: _Extent, limit: float
-) -> IntArray:
-    """The points nearer to an axis than ``limit`` [m], nearest first; of many the nearest of each block."""
-    found, blocks, many = np.empty(_MOST_POINTS, np.int64), np.empty(len(tissue.radii), np.int64), False
-    count, blocked, least = 0, 0, np.inf
-    for k in range(len(blocks)):
-        if not _room(tissue, k, crossing, direction, extent.reach) < limit:
-            continue
-        squared, index = _nearest_in_block(tissue, k, crossing, direction, extent, limit * limit)
-        if index < 0:
-            continue
-        blocks[blocked] = index
-        if squared < least:
-            least = squared
-            blocks[blocked], blocks[0] = blocks[0], index
-        blocked += 1
-        for i in range(tissue.starts[k], tissue.starts[k + 1]):
-            if many or i == index or not _counts(tissue, i, crossing, direction, extent, limit):
-                continue
-            found[count] = i
-            count += 1
-            many = count == _MOST_POINTS
-    if many:
-        return blocks[:blocked]
-    return np.concatenate((blocks[:blocked], found[:count]))
-
-
-@compiled(nogil=True)
-def _counts(
-    tissue: TissuePoints, i: int, crossing: Array, direction: Array, extent: _Extent, limit: float
-) -> bool:
-    """Whether a point counts and is nearer to an axis than ``limit`` [m]."""
-    points, v = tissue.points, extent.viewing
-    x, y, z = points[i, 0] - crossing[0], points[i, 1] - crossing[1], points[i, 2] - crossing[2]
-    along = x * direction[0] + y * direction[1] + z * direction[2]
-    x, y, z = x - along * direction[0], y - along * direction[1], z - along * direction[2]
-    depth = points[i, 0] * v[0] + points[i, 1] * v[1] + points[i, 2] * v[2]
-    near = x * x + y * y + z * z < limit * limit
-    return bool(near and abs(along) <= extent.reach and depth >= extent.lens)

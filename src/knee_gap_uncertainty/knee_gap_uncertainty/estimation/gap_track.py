@@ -94,17 +94,17 @@ class Track:
 
     def continues_with(self, edges: GapEdges, pose: LensPose) -> bool:
         """Whether the edges are of the same points and camera, and the pose continues the earlier ones."""
-        same = edges.track_id == self.track_id and pose.frame_id == self.frame_id
+        same = (edges.track_id, pose.frame_id) == (self.track_id, self.frame_id)
         # Errors of a camera are comparable with those of the same camera only.
-        same_camera = edges.camera_errors.shape[-1] == self._camera_columns
-        return same and same_camera and not self.breaks_at(pose) and not self.ended
+        same &= edges.camera_errors.shape[-1] == self._camera_columns
+        return same and not self.breaks_at(pose) and not self.ended
 
     def breaks_at(self, pose: LensPose) -> bool:
         """Whether the lens made a step, or was lost, between the track's views and this pose."""
         return self._first is not None and pose.segment != self._segment
 
     def add(self, edges: GapEdges, pose: LensPose) -> GapEstimate:
-        """Take the next view and return the estimate at it."""
+        """Add the next view; return the estimate at it."""
         self.profile = None
         blank = GapEstimate(
             stamp_ns=edges.stamp_ns,
@@ -121,11 +121,8 @@ class Track:
         if self._first is None:
             self._first, self._segment = view, pose.segment
         self._follow_direction(view)
-        blank = replace(
-            blank,
-            baseline=float(np.linalg.norm(view.lens - self._first.lens)),
-            view_count=len(self._window),
-        )
+        baseline = float(np.linalg.norm(view.lens - self._first.lens))
+        blank = replace(blank, baseline=baseline, view_count=len(self._window))
         views = self._views_with(view.view)
         fitted, no_fit = self._fitted(views)
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))

@@ -6,7 +6,6 @@ local monotonic clock [ns].
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass
 
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_core.values.stamps import NANOSECONDS
@@ -15,25 +14,25 @@ from knee_gap_perception.trackers.natnet import packets
 from knee_gap_perception.trackers.natnet.buffer import PacketError
 from knee_gap_perception.trackers.natnet.clock import OTHER_CLOCK_NS, EchoClock
 from knee_gap_perception.trackers.natnet.packets import MessageId
+from knee_gap_perception.trackers.natnet.schedule import (
+    ECHO_NS,
+    FINE_CLOCK_NS,
+    FIRST_ECHO_NS,
+    FIRST_ECHOES,
+    FIRST_RETRY_NS,
+    GONE_NS,
+    KEEP_ALIVE_NS,
+    LAST_RETRY_NS,
+    MODELS_NS,
+    MOST_FIRST_ECHOES,
+    NO_DATA_NS,
+    Due,
+)
 from knee_gap_perception.trackers.natnet.words import no_answer, no_data, nothing_usable
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up
 
 Address = tuple[str, int]
 
-FIRST_RETRY_NS = NANOSECONDS // 4
-LAST_RETRY_NS = 4 * NANOSECONDS
-ECHO_NS = NANOSECONDS // 2
-# The first echoes follow each other closely, so that stamps are available soon, and more of them while the
-# clock's error is large.
-FIRST_ECHOES = 8
-MOST_FIRST_ECHOES = 60
-FINE_CLOCK_NS = 100_000
-FIRST_ECHO_NS = 20_000_000
-KEEP_ALIVE_NS = NANOSECONDS // 2
-MODELS_NS = 2 * NANOSECONDS
-# Time without a packet after which the server is lost, and time without a frame after which data are missing.
-GONE_NS = 2 * NANOSECONDS
-NO_DATA_NS = NANOSECONDS
 # A larger jump of the frame numbers is a server that counts from the start again, not a loss.
 MOST_LOST = 100_000
 # Largest age of a frame on arrival, and largest time in the future by the clock's error.
@@ -44,21 +43,6 @@ NEWEST_FRAME_NS = 5_000_000
 USUAL_LATENCIES = 64
 FEWEST_NOT_FITTING = 2
 FRAME_HEAD = int(MessageId.FRAME).to_bytes(2, "little")
-
-
-@dataclass
-class Due:
-    """Next time at which a request is due [ns], and the interval to the one after."""
-
-    at_ns: int = 0
-    every_ns: int = 0
-
-    def take(self, now_ns: int) -> bool:
-        """Whether the request is due; if so, it is postponed by its interval."""
-        if now_ns < self.at_ns:
-            return False
-        self.at_ns = now_ns + self.every_ns
-        return True
 
 
 class NatNetSession:
