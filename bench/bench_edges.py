@@ -1,7 +1,7 @@
 """The edges of the gap on simulated knees whose truth is known, level by level, on seeds of your choice.
 
 A track is scored from its first image on: the surface points behind its first two pixels are its truth.
-Errors are told along and across the edge, in degrees, as the median over tracks of their root mean square;
+Errors are given along and across the edge, in degrees, as the median over tracks of their root mean square;
 NEES is the squared error in units of its own covariance, against its expectation; held is the share of
 images with a valid track while both are to be seen. The gap is what the estimator makes of it with the
 tracked poses: its error against the true instrument gap at the section that the image's edges give, and the

@@ -70,7 +70,7 @@ class Recording:
 
     @classmethod
     def read(cls, bag: Path) -> "Recording":
-        """Read a simulated bag. Raises BagError or SimulationError where it is none."""
+        """Read a simulated bag. Raises BagError or SimulationError if it is not one."""
         with BagReader(bag) as reader:
             topics = [CAMERA_INFO, BODY_POSE, IMAGE]
             stamped = [
@@ -149,7 +149,7 @@ def occluded(begin: float, end: float, offset: float) -> Fault:
 
 
 def zoomed(factor: float) -> Fault:
-    """A picture that shows everything larger by a factor than camera_info says."""
+    """A picture that shows everything larger by a factor than by camera_info."""
 
     def fault(given: Faulty) -> None:
         if given.topic == CAMERA_INFO:

@@ -143,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--inset", type=float, default=2.0, help="[deg] of the points from their edges")
     asked = parser.parse_args(argv)
     if not asked.truth:
-        parser.error("say --truth")
+        parser.error("give --truth")
     knees = []
     for seed in asked.seed:
         try:

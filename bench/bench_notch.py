@@ -1,4 +1,4 @@
-"""What following the notch costs an image, and how well it tells the turn of the scope.
+"""What following the notch costs an image, and how well it measures the turn of the scope.
 
     tools/env python bench/bench_notch.py --first 2001 --seeds 4
 
@@ -26,7 +26,7 @@ from knee_gap_simulation.calibration.scene import BoardCamera
 from knee_gap_simulation.scope.imaging import jpeg
 
 PERIOD_NS = 33_333_333
-FOR_SHAPE = 8  # images from which the notch's shape is told, as a calibration does
+FOR_SHAPE = 8  # images from which the notch's shape is measured, as a calibration does
 
 
 def turned_pictures(seed: int, seconds: float) -> tuple[list[Image], npt.NDArray[np.float64]]:

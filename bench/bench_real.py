@@ -69,7 +69,7 @@ def spread(frames: list[Image], count: int) -> list[Image]:
 
 
 def camera_for(image: Image) -> FisheyeCamera:
-    """A camera of a usual scope: what is told in pixels does not depend on it."""
+    """A camera of a usual scope: what is given in pixels does not depend on it."""
     height, width = image.shape[:2]
     return FisheyeCamera(width, height, 0.6 * height, 0.6 * height, width / 2, height / 2)
 

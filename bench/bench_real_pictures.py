@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def marked(files: Sequence[Path], folder: Path) -> Iterator[tuple[MarkedPicture, Image]]:
-    """Marked pictures of each file, from the folder of its name; says which folders are absent."""
+    """Marked pictures of each file, from the folder of its name; names absent folders."""
     for file in files:
         place = folder / file.stem
         if not place.is_dir():

@@ -1,8 +1,8 @@
 """Segmentation and the decision for a gap, on simulated knees and on real frames that show no gap.
 
-Dice is told inside the field disc, mean and 10th percentile over frames, for every strategy at the working
+Dice is taken inside the field disc, mean and 10th percentile over frames, for every strategy at the working
 size and, to show what that costs, at full size. A false gap is a frame of a closed joint, or a real frame
-without a cleft, in which points were chosen. The reliability table says of the sections found in open and in
+without a cleft, in which points were chosen. The reliability table lists the sections found in open and in
 closed joints, weighted alike, how many are gaps at each confidence.
 
 `--decision` leaves Dice out: many joints, open and closed, each with one direction of travel in turn and
@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def decisions(asked: argparse.Namespace) -> list[Judged]:
-    """Decide on every joint, tell how often it was wrong, and keep the pictures."""
+    """Decide on every joint, report how often it was wrong, and keep the pictures."""
     judged: list[Judged] = []
     directions = list(TravelDirection)
     for level in asked.level:
@@ -174,7 +174,7 @@ def rendered(
 def rendered_one(
     level: int, seed: int, direction: str, asked: argparse.Namespace, *, is_open: bool
 ) -> Iterator[tuple[SimulatorFrame, Camera]]:
-    """Frames of one joint, spread over the travel; none, and it says so, where the travel does not fit."""
+    """Frames of one joint, spread over the travel; none, with a message, if the travel does not fit."""
     try:
         simulator = KneeSimulator(level, seed, direction, gap=FROM_SEED if is_open else None)
     except SimulationError as error:

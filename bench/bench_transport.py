@@ -1,8 +1,8 @@
 """Images at 60 Hz through segmentation_node as real processes, beside a node that only receives and decodes.
 
 A bag is played in real time; every image should give one gap_edges. Latency is from the moment a recorder
-hears the image's camera_info, which is played with it, to the moment it hears the edges. With --all the two
-other nodes run as well, and the poses of the lens guide the search. Without a bag the sample is played
+receives the image's camera_info, which is played with it, to the moment it receives the edges. With --all the
+two other nodes run as well, and the poses of the lens guide the search. Without a bag the sample is played
 forwards and backwards for as long as asked.
 """
 

@@ -25,7 +25,7 @@ class DecodeOnlyNode(BaseNode):
         self._edges.publish(GapEdges(header=message.header))
 
     def health(self) -> tuple[bool, str, Mapping[str, object]]:
-        """Nothing to tell."""
+        """Nothing to report."""
         return rclpy.ok(), "", {}
 
 

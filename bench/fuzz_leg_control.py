@@ -88,7 +88,7 @@ class Fuzz:
         ]
 
     def start_at_rest(self) -> None:
-        """The controller started long ago, and was told that there is no track before the first one began."""
+        """The controller started long ago, and was informed before the first track that there is none."""
         self.control = LegControl(PARAMETERS, self.now - 2.0)
         assert self.control.on_time(self.now - 0.2).measure_again  # type: ignore[union-attr]
         lost = Estimate(False, 0, 0.02, math.nan, math.nan, math.nan, stamp_ns=-1)
@@ -215,7 +215,7 @@ class Fuzz:
         self.moved_until = self.now
 
     def obey(self, command: Command, message: Message | None) -> None:
-        """The leg does as it is told; what it is told is judged."""
+        """The leg follows its commands; the commands are judged."""
         self.counts[command.action.value] += 1
         if command.opening_rate != 0.0 or command.action is not Action.HOLD:
             assert not self.latched, (command, message)

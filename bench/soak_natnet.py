@@ -3,7 +3,7 @@
     tools/env python bench/soak_natnet.py --minutes 10 --rate 240
 
 The server runs in its own process, with lost frames, invalid bits, occlusions, swapped labels, jitter and
-restarts, with --jumps frozen poses and jumps as well; its clock body tells the true time of each exposure,
+restarts, with --jumps frozen poses and jumps as well; its clock body gives the true time of each exposure,
 and the scene the true pose of the scope. Ends with 1 where a stamp was off by a millisecond or more, or a
 pose was called valid that was not the scope's.
 """

@@ -153,7 +153,7 @@ def frame_3(truth: FrameTruth) -> bytes:
 
 
 def natnet_2(origin: str, motive: str) -> tuple[bytes, bytes, bytes]:
-    """What a server of NatNet 2.5 (Motive 1.5.0) or 2.7 (1.7.2) says of itself, and two frames in a row."""
+    """What a server of NatNet 2.5 (Motive 1.5.0) or 2.7 (1.7.2) reports, and two frames in a row."""
     if origin == RECORDED:
         folder = BESIDE / "optitrack/natnet_v2"
         first, second, third = (

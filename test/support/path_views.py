@@ -36,7 +36,7 @@ def views_of(
 
 
 def noisy(rng: np.random.Generator, count: int, deviation: float = DEVIATION, share: float = 0.0) -> Views:
-    """Views of the path with errors as they are said to be."""
+    """Views of the path with errors as large as stated."""
     lens = lens_path(count)
     bearings = directions(lens)
     side = np.cross(bearings, [0.0, 1.0, 0.0])

@@ -105,7 +105,7 @@ def test_what_fits_may_pass(subscriber: Subscriber) -> None:
     ids=str,
 )
 def test_all_else_holds(subscriber: Subscriber, changes: dict[str, Any]) -> None:
-    assert subscriber.answer(**changes, reason="as told") == "hold: as told"
+    assert subscriber.answer(**changes, reason="as given") == "hold: as given"
 
 
 def test_silence_holds(subscriber: Subscriber) -> None:

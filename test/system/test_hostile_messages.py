@@ -31,7 +31,7 @@ from knee_gap_msgs.msg import GapEdges, GapEstimate, ScopeCalibration, ScopeRota
 from knee_gap_simulation.recordings.recording import IMAGE
 
 DOMAIN = 132
-# As the suite is shipped, so that the seam itself is tested; the diagnostics say that it had nothing to do.
+# As the suite is shipped, so that the seam itself is tested; the diagnostics show that it had nothing to do.
 ENVIRONMENT = {
     "ROS_DOMAIN_ID": str(DOMAIN),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",

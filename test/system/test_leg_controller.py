@@ -37,7 +37,7 @@ class Leg:
         self._reset = client.node.create_client(Trigger, "leg_controller_node/reset")
         client.wait_matched()
         client.spin_until(self._reset.service_is_ready)
-        # The track that it hears of first may have begun before the leg came to rest.
+        # The track that it receives first may have begun before the leg came to rest.
         began = time.monotonic()
         while not self.asked and time.monotonic() < began + 5.0:
             self.publish(0.0045, 0.005)

@@ -1,4 +1,4 @@
-"""tracking_node on a Motive that errs: what is no measurement is not published, and diagnostics say why."""
+"""tracking_node on a Motive that errs: false poses are not published, and diagnostics give the reason."""
 
 from pathlib import Path
 
@@ -58,11 +58,11 @@ class Judged:
         return self._client.received["scope_pose"]
 
     def words(self) -> list[str]:
-        """What the node said of itself, each second."""
+        """Messages of the node's diagnostics, one a second."""
         return [status.message for array in self._client.received["/diagnostics"] for status in array.status]
 
     def refused(self, reason: str) -> int:
-        """How many poses were refused for a reason, as last told."""
+        """How many poses were refused for a reason, as last reported."""
         reported = [status for array in self._client.received["/diagnostics"] for status in array.status]
         return int({pair.key: pair.value for pair in reported[-1].values}.get(f"refused: {reason}", 0))
 

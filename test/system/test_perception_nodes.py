@@ -1,4 +1,4 @@
-"""segmentation_node and tracking_node as processes: bad input is told and survived, good input passes."""
+"""segmentation_node and tracking_node as processes: bad input is reported and survived, good input passes."""
 
 import subprocess
 from collections.abc import Iterator
@@ -190,7 +190,7 @@ def test_tracking_node_publishes_good_poses_only(tmp_path: Path) -> None:
         processes.check("tracking_node")
         published = client.received["scope_pose"][before:]
         assert all(np.isfinite(m.pose.pose.position.x) for m in published)
-        assert len(published) <= 1  # a stamp that ran backwards may begin anew, and nothing else may pass
+        assert len(published) <= 1  # a stamp that ran backwards may begin again, and nothing else may pass
 
 
 @pytest.mark.parametrize(
@@ -256,5 +256,5 @@ def test_inputs_that_nobody_publishes_are_named_and_compressed_images_are_found(
 
 
 def said(client: Client) -> list[str]:
-    """What the node has said of itself."""
+    """Messages of the node's diagnostics."""
     return [status.message for array in client.received["/diagnostics"] for status in array.status]

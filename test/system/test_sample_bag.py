@@ -112,7 +112,7 @@ def test_live_and_offline_say_the_same(live: tuple[Path, list[str]], processed: 
     both = [s for s in gaps_here if s in gaps_there and gaps_here[s].status == VALID == gaps_there[s].status]
     assert len(both) > 200
     if not all(same):
-        # A pose that came after its image had waited is foretold, and the track goes on from there.
+        # A pose that came after its image had waited is predicted, and the track goes on from there.
         warnings.warn(f"live, a pose came too late for image {same.index(False)}", stacklevel=1)
         assert np.nanmax(apart) < 0.1
         assert max(abs(gaps_here[s].gap - gaps_there[s].gap) for s in both) < 0.1e-3

@@ -1,4 +1,4 @@
-"""Nodes whose callbacks raise: they live, start their core afresh, and tell what was refused."""
+"""Nodes whose callbacks raise: they live, reset their core, and report what was refused."""
 
 import sys
 from collections.abc import Iterator

@@ -90,7 +90,7 @@ class Feed:
         return future.result()
 
     def reported(self, words: str) -> bool:
-        """Whether the latest diagnostics say a word."""
+        """Whether the latest diagnostics contain a word."""
         texts = [
             status.message for array in self.client.received["/diagnostics"][-1:] for status in array.status
         ]
@@ -269,7 +269,7 @@ def test_an_unusual_picture_gives_points_all_the_same(
     feed.call(Trigger, "restart", Trigger.Request())
     edges = feed.send(np.ascontiguousarray(picture), encoding)
     for turn in range(30):
-        # Where the field of view has moved it is found anew within half a second.
+        # Where the field of view has moved it is found again within half a second.
         if edges.status == VALID:
             break
         edges = feed.send(np.ascontiguousarray(noisy(picture, turn)), encoding)

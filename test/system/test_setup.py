@@ -1,4 +1,4 @@
-"""Set-up refuses what it cannot build on, in one line that says what to do."""
+"""Set-up refuses what it cannot build on, in one line that names what to do."""
 
 import os
 import shutil

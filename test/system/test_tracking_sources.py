@@ -47,7 +47,7 @@ def test_poses_come_from_motive_and_come_back_after_a_restart(version: str, tmp_
         stamps = np.array([stamp(message) for message in poses])
         assert (np.diff(stamps) > 0.0).all()
         assert np.median(np.diff(stamps)) == pytest.approx(1 / 120, abs=5e-4)
-        # Exposure lies before arrival, by the latency that the server was told and not by much more.
+        # Exposure lies before arrival, by the latency set in the server and not by much more.
         assert 0.0 < time.time() - stamp(poses[-1]) < 1.0
 
         processes.end("server")
@@ -92,7 +92,7 @@ def test_leg_as_reference(tmp_path: Path) -> None:
 
 
 def reported_words(tmp_path: Path, server: list[str], settings: dict[str, str], words: str) -> str:
-    """What diagnostics say once they hold `words`, with a server and settings of tracking_node."""
+    """The diagnostics once they hold `words`, with a server and settings of tracking_node."""
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         processes.start("server", [executable("knee_gap_simulation", "natnet_server"), *server])
         node = [executable("knee_gap_perception", "tracking_node"), *NODE, "-p", "source:=natnet"]

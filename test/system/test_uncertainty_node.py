@@ -134,7 +134,7 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     assert [last.point_0.x, last.point_0.y, last.point_0.z] == pytest.approx(POINTS[0], abs=1e-6)
     assert len(client.received["gap/min"]) == len(good)
 
-    # The tracker goes: the first image without a pose already says so, and carries no number.
+    # The tracker goes: the first image without a pose already reports it, and carries no number.
     before, numbers = len(gap), len(client.received["gap/min"])
     track.run(6, edges=True, poses=False)
     client.spin_until(lambda: len([e for e in gap[before:] if e.track_id]) >= 6)
@@ -148,7 +148,7 @@ def test_measures_and_tells_every_loss(client: Client) -> None:
     track.run(10)
     client.spin_until(lambda: any(e.status == GapEstimate.STATUS_VALID for e in gap[before:]))
 
-    # The images go: said within the deadline, again and again, without a number.
+    # The images go: reported within the deadline, again and again, without a number.
     before = len(gap)
     client.spin(0.5)
     silence = gap[before + 1 :]

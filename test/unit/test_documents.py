@@ -15,7 +15,7 @@ PAGES = sorted(
         *SOURCES.glob("*/*.md"),
     ]
 )
-# What happened is told by the names that things had then.
+# The history uses the names that things had then.
 PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 PACKAGES = sorted(path.name for path in SOURCES.iterdir() if (path / "package.xml").is_file())
 ARCHITECTURE = ROOT / "docs" / "architecture.md"

@@ -40,7 +40,7 @@ class FileError(KneeGapError):
 def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading, never waiting for another process.
 
-    Raises FileError where there is none, or it may not be read.
+    Raises FileError if there is none, or it may not be read.
     """
     try:
         # A FIFO without a writer would block a plain open.
@@ -91,12 +91,12 @@ def yaml_value(text: str) -> Any:
         line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
         raise ValueError(f"{_one_line(error.problem or 'damaged')}{line}") from None
     except (YAMLError, ValueError, TypeError, OverflowError, AttributeError, LookupError) as error:
-        # A date that is none, a number too large, a key that cannot be one.
+        # An impossible date, a number too large, a key of a wrong kind.
         raise ValueError(_one_line(str(error)) or "damaged") from None
 
 
 def json_value(text: str) -> Any:
-    """Return the value of a JSON text. Raises ValueError, one line, for what is none or nested too deeply."""
+    """Return the value of a JSON text. Raises ValueError, one line, for another text or deep nesting."""
     depth = deepest = 0
     for letter in text:
         if letter in "[{":

@@ -135,7 +135,7 @@ def _offered(topic: Topic) -> QoSProfile:
 
 
 def _recorded(topic: Topic) -> QoSProfile:
-    """Return the quality of service that the bag says; that of `_offered` where it says none."""
+    """Return the quality of service recorded in the bag; that of `_offered` if there is none."""
     if not topic.qos:
         return _offered(topic)
     reliable = all(qos.reliability == QosReliability.RELIABLE for qos in topic.qos)
@@ -214,8 +214,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 raise BagError(f"--wait-for {', '.join(unplayed)}: not played")
             node.wait_for_subscribers(arguments.wait_for, arguments.wait_timeout, stop)
             begin = time.monotonic()
-            with keys(controls.press) as heard:
-                if heard:
+            with keys(controls.press) as listening:
+                if listening:
                     print("play: space pauses, n plays one message, up and down change the rate", flush=True)
                 if not stop.wait(arguments.delay):
                     played = _play(node, reader, arguments, stop, controls)
@@ -256,7 +256,7 @@ def _parser() -> Parser:
         "--qos",
         choices=("reliable", "recorded"),
         default="reliable",
-        help="offer reliable topics, which suit every subscriber, or what the bag says; latched topics are "
+        help="offer reliable topics, which suit every subscriber, or as recorded; latched topics are "
         "always those of the bag",
     )
     parser.add_argument(

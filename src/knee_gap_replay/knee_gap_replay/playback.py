@@ -166,7 +166,7 @@ class Played(NamedTuple):
     late_ns: "array[int]" = array("q")
 
     def late_words(self) -> str:
-        """Say how late the messages were."""
+        """Report how late the messages were."""
         usual = float(np.percentile(self.late_ns, 99)) if self.late_ns else 0.0
         return f"at most {self.latest_ns * 1e-6:.1f} ms late, 99 % within {usual * 1e-6:.2f} ms"
 

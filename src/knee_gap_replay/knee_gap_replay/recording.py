@@ -34,7 +34,7 @@ class WriterThread(threading.Thread):
         self._bag = bag
         self._memory_bytes = memory_bytes
         self._put_bytes = self._written_bytes = 0
-        # What the disk has no space for, and whether it has been said.
+        # What the disk has no space for, and whether it has been reported.
         self._waiting_bytes = 0
         self._full = False
         self._queue: queue.SimpleQueue[BagMessage | tuple[str, str, Sequence[Qos]] | None] = (

@@ -65,7 +65,7 @@ class EstimatorParameters:
         default=1.0,
         metadata={
             "description": "share of the bearings' variance along the parallax that lasts over a track: at 1 "
-            "a depth is known no better than the best single views tell it, however many there are; "
+            "a depth is known no better than from the best single views, however many there are; "
             "common_share apart [-]",
             "range": (0.0, 1.0),
         },

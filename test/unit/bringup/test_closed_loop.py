@@ -1,4 +1,4 @@
-"""The closed loop: the leg obeys late, no instrument passes that does not fit, and the loop would say so."""
+"""The closed loop: the leg obeys late; an instrument that passes and does not fit would be reported."""
 
 from dataclasses import replace
 

@@ -54,7 +54,7 @@ REFUSED = {
 
 
 def at_rest(parameters=PARAMETERS, now=10.0):
-    """A controller that has started, has requested a new track, and was told that there is none yet."""
+    """A controller that has started, has requested a new track, and was informed that there is none yet."""
     control = LegControl(parameters, now - 2.0)
     assert control.on_time(now - 0.2).measure_again
     control.on_estimate(LOST._replace(stamp_ns=-(10**6)), now - 0.1)
@@ -285,7 +285,7 @@ def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
 def test_a_controller_that_starts_acts_on_no_track_that_may_have_begun_before() -> None:
     control = LegControl(LegParameters(settling=0.3), 10.0)
     running = images(*[WIDE] * 40)
-    # It starts, and hears of the track at once, or only after it has come to rest: both are of before.
+    # It starts, and receives the track at once, or only after it has come to rest: both are of before.
     assert control.on_estimate(running[0], 10.1).action is Action.HOLD
     assert control.on_estimate(running[1], 10.35).measure_again
     late = LegControl(LegParameters(settling=0.3), 10.0)

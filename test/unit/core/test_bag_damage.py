@@ -1,4 +1,4 @@
-"""What is left of a damaged bag is given; what is lost is told; nothing false is ever given."""
+"""What is left of a damaged bag is given; what is lost is reported; nothing false is ever given."""
 
 import logging
 from pathlib import Path

@@ -140,7 +140,7 @@ def test_mistakes_are_refused_by_name(tmp_path: Path, bag: Path) -> None:
 
 
 def test_an_old_definition_in_a_bag_is_read_as_the_bag_has_it(bag: Path) -> None:
-    """The type's name alone does not say how its bytes are laid out."""
+    """The type's name alone does not determine how its bytes are laid out."""
     content = (bag / "bag_0.mcap").read_bytes()
     # In every copy of the schema the pose's two parts change places, as an older version might have had them.
     swapped = content.replace(
@@ -156,7 +156,7 @@ def test_an_old_definition_in_a_bag_is_read_as_the_bag_has_it(bag: Path) -> None
 
 
 def _zero_chunk_checksums(content: bytes) -> bytes:
-    """Set the checksum of every chunk, and of the index, to 0: "not told"."""
+    """Set the checksum of every chunk, and of the index, to 0: "not given"."""
     out, offset = bytearray(content), 8
     while offset < len(content) - 8:
         opcode = content[offset]

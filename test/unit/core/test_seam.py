@@ -1,4 +1,4 @@
-"""What a core raises ends at its message: refused, counted, told once where it came from."""
+"""What a core raises ends at its message: refused, counted, reported once with its place."""
 
 import inspect
 import os

@@ -82,7 +82,7 @@ def test_dot_distances_by_motion_stereo(origin: str, name: str, tmp_path: Path) 
 
 @pytest.mark.parametrize("origin", ORIGINS)
 def test_pivoting_a_real_scope(origin: str, tmp_path: Path) -> None:
-    """Halves of the recording agree within what each says of itself, and with the truth where it is known."""
+    """Halves of the recording agree within their stated errors, and with the truth where it is known."""
     recording = tracked_laparoscope(origin, tmp_path)
     poses = np.array([transform_mm(path) for path in sorted((recording.folder / "pivot").glob("*.txt"))])
     whole, halves = calibrate_pivot(poses), (calibrate_pivot(poses[:200]), calibrate_pivot(poses[200:]))

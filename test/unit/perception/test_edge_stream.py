@@ -1,4 +1,4 @@
-"""Images that wait for the pose after them, and what is said of poses used and points hidden."""
+"""Images that wait for the pose after them, and what is reported of poses used and points hidden."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -68,7 +68,7 @@ def test_an_image_waits_for_the_pose_after_it_and_no_longer(joint: Any, travel: 
 
     made.on_image(bgr_image(travel[1][1], 6 * POSE_NS), now_ns=10 * MS)
     assert list(made.ready(39 * MS)) == []
-    (edges,) = made.ready(40 * MS)  # by then the pose is foretold
+    (edges,) = made.ready(40 * MS)  # by then the pose is predicted
     assert (edges.status, edges.pose_used) == (EdgeStatus.VALID, True)
 
 
@@ -94,9 +94,9 @@ def test_what_is_interpolated_does_not_depend_on_when_the_image_came(joint: Any,
     assert all(used for _, _, used in answers[0])
 
 
-@pytest.mark.parametrize("case", ["no poses", "told not to wait", "the tracker fell silent", "clock back"])
+@pytest.mark.parametrize("case", ["no poses", "does not wait", "the tracker fell silent", "clock back"])
 def test_an_image_does_not_wait_in_vain(joint: Any, travel: Any, case: str) -> None:
-    made = stream(joint, wait=0.0 if case == "told not to wait" else 0.03)
+    made = stream(joint, wait=0.0 if case == "does not wait" else 0.03)
     stamp = 10 * POSE_NS
     if case != "no poses":
         still_poses(made, 9 * POSE_NS if case != "the tracker fell silent" else 2 * POSE_NS)

@@ -1,4 +1,4 @@
-"""The gap found, its points chosen and followed; the same answer twice; bad input told."""
+"""The gap found, its points chosen and followed; the same answer twice; bad input reported."""
 
 from pathlib import Path
 from typing import Any

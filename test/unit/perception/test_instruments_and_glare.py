@@ -37,7 +37,7 @@ SCALE = 0.25
 
 
 class Shaft(NamedTuple):
-    """The shaft of an instrument from a pixel to another one, half as wide as `half` [px] says."""
+    """The shaft of an instrument from a pixel to another one, half as wide as `half` [px]."""
 
     start: tuple[float, float]
     end: tuple[float, float]

@@ -1,4 +1,4 @@
-"""The command `mark`: what its page is told, what it may write, and who may ask."""
+"""The command `mark`: what its page receives, what it may write, and who may ask."""
 
 import http.client
 import json

@@ -166,7 +166,7 @@ def test_errors_of_the_cameras_numbers_go_through_the_window() -> None:
     bearings = camera_in_medium(camera, ratio).bearings(pixels)
 
     class One:
-        """The camera's errors alone, few enough to be told one by one."""
+        """The camera's errors alone, few enough to be given one by one."""
 
         def of(self, reported: Array) -> Array:
             return source.of(reported)[..., :3]
@@ -244,7 +244,7 @@ def test_a_stream_converts_camera_info_and_a_calibration_alike() -> None:
 def test_a_camera_info_of_another_medium_is_compared_in_that_of_use() -> None:
     stream = EdgeStream(calibration=Calibration(1280, 720, INTRINSICS, medium=SALINE))
     k, d = list(INTRINSICS.k), list(INTRINSICS.d)
-    stream.on_camera_info(told_info(k=k, d=d))  # the same numbers, said of air
+    stream.on_camera_info(told_info(k=k, d=d))  # the same numbers, for air
     assert any("differs from the calibration by" in words for words in stream.counts)
     same = EdgeStream(
         calibration=Calibration(1280, 720, INTRINSICS, medium=SALINE), camera_info_medium=SALINE

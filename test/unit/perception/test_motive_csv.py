@@ -122,7 +122,7 @@ class TestVarieties:
 
 
 class TestResaved:
-    """What comes out of a spreadsheet, a script or an old version, and still says all that is needed."""
+    """What comes out of a spreadsheet, a script or an old version, and still holds all that is needed."""
 
     def check(self, tmp_path, text):
         take = read_take(written(tmp_path, text), up_axis="z")
@@ -235,7 +235,7 @@ class TestRefusals:
                 cut = read_take(written(tmp_path, text[:length]))
             except TakeError:
                 continue
-            # At the end of a line only the header's count tells a shorter take from a whole one.
+            # At the end of a line only the header's count distinguishes a shorter take from a whole one.
             assert text[:length].endswith("\n")
             assert len(cut.time) < cut.exported_count == len(whole.time)
 

@@ -1,4 +1,4 @@
-"""How a patch of surface is found again: where it is, and that its covariance says how well that is known."""
+"""How a patch of surface is found again: where it is, and that its covariance is as large as its error."""
 
 import cv2
 import numpy as np

@@ -85,7 +85,7 @@ def test_a_notch_that_turns_through_the_gap_is_right_wherever_it_is_told() -> No
             reported.append(np.degrees(wrapped(observation.angle - angle)))
         else:
             assert np.isnan(observation.angle)
-    # Where the gap reaches the border it does not show, and nothing is said.
+    # Where the gap reaches the border it does not show, and nothing is reported.
     assert hidden > 5
     assert len(reported) > 85
     assert np.abs(reported).max() < 0.5

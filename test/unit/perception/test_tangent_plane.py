@@ -66,7 +66,7 @@ def test_standing_still_teaches_nothing():
 
 
 def test_it_forgets_while_nothing_is_seen_of_it():
-    """A registration that tells nothing leaves the plane less sure than before, never surer."""
+    """A registration without information leaves the plane less sure than before, never surer."""
     plane = _learnt(40)
     before = _depth_error(plane)
     for x in np.linspace(TRAVEL, 2 * TRAVEL, 20)[1:]:

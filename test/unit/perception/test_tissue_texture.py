@@ -1,4 +1,4 @@
-"""How much texture there is at a place: what a patch there could tell, and debris counts for little of it."""
+"""How much texture there is at a place: how well a patch measures; debris counts for little of it."""
 
 import cv2
 import numpy as np

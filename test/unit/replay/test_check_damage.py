@@ -1,4 +1,4 @@
-"""check on bags that are damaged, replayed or foreign: what it saves, and what it says."""
+"""check on bags that are damaged, replayed or foreign: what it saves, and what it reports."""
 
 import logging
 from pathlib import Path

@@ -239,7 +239,7 @@ def test_lens_poses_are_those_of_the_body_with_the_lens_on_it() -> None:
 
 
 def test_when_the_tracker_goes_silent_so_do_valid_estimates() -> None:
-    """As live: an image whose next pose does not come within the allowed wait is said to be lost."""
+    """As live: an image whose next pose does not come within the allowed wait is reported as lost."""
     outputs = run(3_000_000_000, 2_000_000_000)
     gaps = on(outputs, "/space/gap")
     assert len(gaps) == 180

@@ -15,7 +15,7 @@ TYPE = "std_msgs/msg/Float64"
 
 
 def do(job: Job, workers: int | None = None) -> Result:
-    """Take the place of `process_one`: write a bag, fail, or die, as the name of the bag says."""
+    """Take the place of `process_one`: write a bag, fail, or die, as the name of the bag requests."""
     assert workers == 1
     name = Path(job.bag).name
     if name.startswith("dies"):

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.timeout(900)  # 67 images are rendered
 
 @pytest.fixture(scope="module")
 def wet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Rims in saline, seen by a scope of which camera_info tells the angles in air."""
+    """Rims in saline, seen by a scope whose camera_info has the angles in air."""
     bag = tmp_path_factory.mktemp("wet") / "bag"
     recording = Recording(
         seed=21, duration_s=2.8, fps=24.0, travel=0.006, depth=0.011, calibrated_in="air", portal=0.040

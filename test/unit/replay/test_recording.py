@@ -1,4 +1,4 @@
-"""The recorder's writing thread keeps the order, counts what it drops, and tells what went wrong."""
+"""The recorder's writing thread keeps the order, counts what it drops, and reports what went wrong."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Pages of bags: what they say is what the bag holds, nothing is fetched, a bad bag costs only itself."""
+"""Pages of bags: they show what the bag holds, nothing is fetched, a bad bag costs only itself."""
 
 import base64
 import csv
@@ -196,7 +196,7 @@ def test_frames_are_drawn_on_the_images(pages: Path) -> None:
     found = [base64.b64decode(text) for text in re.findall(r"data:image/jpeg;base64,([\w+/=]+)", page)]
     pictures = [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in found]
     assert len(pictures) == 5
-    # Six chosen; one cannot be decoded, which is said.
+    # Six chosen; one cannot be decoded, which is reported.
     assert "cannot be decoded" in page
     for picture in pictures:
         # Only the disc is shown, and the circle between the edges is drawn on it.
@@ -264,7 +264,7 @@ def test_a_bad_bag_is_one_line_and_the_others_are_reported(
     index = (out / "index.html").read_text()
     assert f"{tmp_path / 'none'} does not exist" in index
     assert 'href="results-2.html"' in index
-    # Without the bag of inputs there is neither truth nor picture, and that is said.
+    # Without the bag of inputs there is neither truth nor picture, and that is reported.
     page = (out / "results-2.html").read_text()
     assert "it is not simulated" in page
     assert "name the bag of inputs with --input" in page

@@ -198,7 +198,7 @@ def test_meshes_that_make_no_knee_are_refused_in_one_line(tmp_path, capsys, kind
         ("--anatomy {folder} --gap-mm 11.9", "cannot be opened to 11.9 mm"),
         ("--anatomy {folder} --flexion-deg 170", "flexion must lie in [0, 130] degrees"),
         ("--compartment lateral", "are for --anatomy"),
-        ("--anatomy {folder}/empty", "holds no mesh (STL, PLY, OBJ) whose name says 'femur'"),
+        ("--anatomy {folder}/empty", "holds no mesh (STL, PLY, OBJ) whose name contains 'femur'"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(folder, tmp_path, capsys, arguments, message):

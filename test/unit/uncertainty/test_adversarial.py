@@ -1,7 +1,7 @@
 """Inputs that lie: of what the estimator then calls valid, the truth is never outside the worst case.
 
 A lens in a trembling hand passes two points at 60 images and 120 poses a second, with the errors that are
-told of it; then something goes wrong that nobody tells.
+reported of it; then something goes wrong that is not reported.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ TREMOR = 2.0 * np.pi * np.array([4.1, 5.3, 6.2])
 
 @dataclass
 class Scope:
-    """What is true, and what is said of it, at a time [s]; a test replaces what goes wrong."""
+    """The truth, and what is reported of it, at a time [s]; a test replaces what goes wrong."""
 
     rng: np.random.Generator
     travel: float = 8e-3
@@ -74,7 +74,7 @@ class Scope:
         return float(np.linalg.norm(np.diff(self.points(t), axis=0)))
 
     def pose(self, t: float) -> LensPose:
-        """What the tracker says."""
+        """The pose that the tracker reports."""
         position, rotation = self.place(t - self.late)
         turned = Rotation.from_rotvec(ROTATION_ERROR / np.sqrt(3) * self.rng.standard_normal(3)) * rotation
         pose = LensPose(
@@ -87,13 +87,13 @@ class Scope:
         return self.pose_reported(pose, t)
 
     def leg(self, t: float) -> LensPose:
-        """What the tracker says of a body fixed to the second point."""
+        """The reported pose of a body fixed to the second point."""
         position = [0.1, 0.0, 0.0] + self.shift(t)[1] + LENS_ERROR / np.sqrt(3) * self.rng.standard_normal(3)
         turned = Rotation.from_rotvec(ROTATION_ERROR / np.sqrt(3) * self.rng.standard_normal(3))
         return LensPose(SECOND + round(t * 1e9), "world", position, turned.as_quat(), np.zeros((6, 6)))
 
     def edges(self, t: float) -> GapEdges:
-        """What the camera says."""
+        """The edges that the camera reports."""
         position, rotation = self.place(t)
         towards = rotation.inv().apply(self.points(t) - position)
         bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -109,7 +109,7 @@ class Scope:
         )
 
     def estimates(self, estimator: GapEstimator | None = None) -> list[GapEstimate]:
-        """Let the estimator see and hear it all."""
+        """Feed the estimator with all of it."""
         estimator = estimator or GapEstimator(EXACT)
         found = []
         for k in range(IMAGES):

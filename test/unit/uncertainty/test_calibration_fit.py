@@ -1,4 +1,4 @@
-"""What a wrong calibration does to the views of a track is told from a joint that moves."""
+"""What a wrong calibration does to the views of a track is distinguished from a joint that moves."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The estimator: what it says of views it was given, and what it says when something is missing."""
+"""The estimator: its estimates from given views, and its reasons when something is missing."""
 
 import math
 from collections.abc import Callable
@@ -229,7 +229,7 @@ def test_rubbish_bearings_are_told_and_survived(bad: float) -> None:
 
 
 def test_pose_that_is_repeated_under_new_stamps_is_lost_tracking() -> None:
-    """Whoever sends the pose: no old value is taken for a new one while the scope moves on."""
+    """No old pose is taken for a new one while the scope moves on, from any sender."""
     estimator = GapEstimator(EXACT)
     assert run(estimator, list(np.linspace(0.0, 0.006, 30)))[-1].status is GapStatus.VALID
     begin = 10**9 + 30 * FRAME_NS

@@ -1,4 +1,4 @@
-"""The joint that moves: what is found, what is not taken for motion, and what the estimator then says."""
+"""The joint that moves: what is found, what is not taken for motion, and what the estimator then reports."""
 
 from math import radians
 

@@ -90,7 +90,7 @@ def test_the_drift_that_is_open_is_the_error_against_the_parallax_of_one_of_the_
     drifts = single_view_drift(fitted, views, views.lens_positions[0])
     for n in range(2):
         each = np.sort([_drift_of_a_view(views, index, n) for index in range(5, VIEWS)])
-        # The first decile of the 29 views that tell any lies between the third and the fourth.
+        # The first decile of the 29 views that measure any lies between the third and the fourth.
         assert drifts[n] == pytest.approx(0.2 * each[2] + 0.8 * each[3], rel=0.05)
 
 
@@ -127,7 +127,7 @@ def test_a_covariance_without_an_inverse_gives_a_number() -> None:
 
 
 def test_an_error_beside_the_turn_that_goes_with_one_along_it_is_made_use_of() -> None:
-    """A line in the picture 30 degrees from the parallax: what it tells of the depth is not its long axis."""
+    """A line in the picture 30 degrees from the parallax: its error of depth is not along its long axis."""
     fitted, views = drifting(np.zeros(2))
     turned = np.array([np.cos(np.radians(30)), np.sin(np.radians(30)), 0.0])
 
@@ -153,7 +153,7 @@ def test_where_residuals_show_larger_errors_more_is_left_open() -> None:
 
 
 def test_an_error_that_lasts_is_held_however_many_views_repeat_it_and_not_by_far_too_much() -> None:
-    """Each view by itself errs along its parallax as much as it says, and all of them the same way."""
+    """Each view by itself errs along its parallax as much as it states, and all of them the same way."""
     rng, runs = np.random.default_rng(5), 400
     truth = float(np.linalg.norm(POINTS[1] - POINTS[0]))
     _, views = drifting(np.zeros(2))

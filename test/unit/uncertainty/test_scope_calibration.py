@@ -79,7 +79,7 @@ def test_a_calibrations_error_that_is_none_leaves_nothing_valid(covariance: Arra
 
 
 def test_what_was_not_calibrated_has_the_errors_that_the_parameters_state() -> None:
-    """Uncalibrated is wide, not silent: nothing is taken for exact because nobody said how wrong it is."""
+    """Uncalibrated is wide, not silent: nothing is taken for exact because nobody stated its error."""
     limits = EstimatorParameters()
     nothing = ScopeCalibration("tracking_node", "a" * 64, np.full((6, 6), np.nan), np.nan)
     assert not nothing.flaw()

@@ -1,4 +1,4 @@
-"""A scope that is turned in its camera head: what that does to a calibration's error, and who tells of it."""
+"""A scope that is turned in its camera head: what that does to a calibration's error, and who reports it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -125,7 +125,7 @@ def test_turns_are_kept_by_their_stamps_and_never_taken_from_afar() -> None:
 def turned_estimates(
     turn_at: Callable[[int], float | None], *, followed: bool = False, late: bool = False, shift: int = 0
 ) -> tuple[list[GapEstimate], GapEstimator]:
-    """What the estimator says of 40 views, a turn told with each where `turn_at` has one; `late`: last."""
+    """Estimates of 40 views, a rotation reported with each where `turn_at` has one; `late`: last."""
     estimator, views, found = GapEstimator(replace(EXACT, least_baseline_share=0.0)), scope(40, 0.0), []
     estimator.add_calibration(
         replace(reported("tracking_node", "a" * 64, error=SHIFT), rotation_followed=followed)

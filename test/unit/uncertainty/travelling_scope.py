@@ -85,7 +85,7 @@ def camera_errors(views: Views, *columns: int) -> Array:
 
 
 def observed(views: Views, k: int, stamp_ns: int, errors: Array = NO_ERRORS) -> tuple[GapEdges, LensPose]:
-    """One of the views as the estimator is told of it: the edges in an image, and the pose of the lens.
+    """One of the views as it is reported to the estimator: the edges in an image, and the pose of the lens.
 
     `errors` (2, 3, n) are what the camera's own errors do to the bearings, in the frame of the views.
     """
@@ -108,9 +108,9 @@ def estimates(
     scope_rotation: float = 0.0,
     parameters: EstimatorParameters = EXACT,
 ) -> list[GapEstimate]:
-    """What the estimator says of 40 views of the travelling scope, `camera` times its errors told.
+    """Estimates of 40 views of the travelling scope, with `camera` times its errors reported.
 
-    None tells no error of the camera. It turns in its camera head by `scope_rotation` [rad] on the way.
+    None: no error of the camera is reported. It turns in its camera head by `scope_rotation` [rad].
     """
     estimator, views, found = GapEstimator(parameters), scope(40, turning), []
     errors = np.zeros((40, 2, 3, 0)) if camera is None else camera * camera_errors(views, 0, 1, 2)

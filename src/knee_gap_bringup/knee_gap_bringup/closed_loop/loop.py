@@ -151,7 +151,7 @@ class ClosedLoop:
             self._images.clear()
             return []
         if self._estimator is None:
-            # As a node that was started: it says that it has received nothing yet.
+            # As a node that was started: it reports that it has received nothing yet.
             self._estimator = GapEstimator(EstimatorParameters(**EXACT_SCOPE))
             published += self._estimator.begin(now_ns)
         while self._images and self._images[0][0] <= tick:

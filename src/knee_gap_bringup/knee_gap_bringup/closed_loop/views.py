@@ -1,4 +1,4 @@
-"""What the estimator is given of a knee that opens: bearings and poses drawn from its truth."""
+"""Simulated observations of a knee that opens: bearings and poses drawn from its truth."""
 
 from dataclasses import dataclass, replace
 
@@ -52,7 +52,7 @@ class OpeningKnee:
         self._seen: dict[int, _Seen] = {}
 
     def measure_again(self) -> None:
-        """End the track: the next image chooses its points anew."""
+        """End the track: the next image chooses its points again."""
         self._section = None
 
     def observe(self, stamp_ns: int, time: float, opening: float) -> tuple[GapEdges, LensPose]:

@@ -41,7 +41,7 @@ class BagMessage(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """What a bag says of one of its topics."""
+    """What a bag records of one of its topics."""
 
     msgtype: str
     qos: tuple[Qos, ...]
@@ -94,7 +94,7 @@ class BagReader:
             file.close()
 
     def count(self, topics: Collection[str] | None = None) -> int | None:
-        """Return the number of messages of `topics`, as the index tells it; None where there is none."""
+        """Return the number of messages of `topics`, from the index; None if there is no index."""
         counts = [file.counts for file in self._files]
         if any(count is None for count in counts):
             return None
@@ -211,7 +211,7 @@ class BagReader:
         return files
 
     def _information(self) -> dict[str, Any]:
-        """Return what metadata.yaml says; nothing where a recorder was killed before it wrote any."""
+        """Return the contents of metadata.yaml; nothing if a recorder was killed before it wrote any."""
         path = self.path / "metadata.yaml"
         if not os.path.lexists(path):
             return {}

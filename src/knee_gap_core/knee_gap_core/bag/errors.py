@@ -4,7 +4,7 @@ from knee_gap_core.values.errors import KneeGapError
 
 
 class BagError(KneeGapError):
-    """A bag, topic, type or command that cannot be used; the message is one line and says why."""
+    """A bag, topic, type or command that cannot be used; the message is one line and gives the reason."""
 
 
 class DiskFullError(BagError):

@@ -83,7 +83,7 @@ class Entry(NamedTuple):
 class McapFile:
     """The readable part of one MCAP file.
 
-    `counts` are the messages by topic, as the index tells them; None without one. `losses` has one line for
+    `counts` are the messages by topic, as the index counts them; None without one. `losses` has one line for
     each part that is not readable; it grows while blocks are read. Raises BagError where the file is no MCAP
     file at all or cannot be opened. To `salvage` is to read what is complete in a chunk that is cut, too.
     """
@@ -178,12 +178,12 @@ class McapFile:
             tail = self._file.read(self._size - start)
             is_sound = known in (0, zlib.crc32(tail[: -MAGIC_SIZE - _CHECKSUM_SIZE]))
             summary = _summary_of(tail) if is_sound else None
-        except Exception:  # a cut or damaged end fails in many ways; the walk tells what is lost
+        except Exception:  # a cut or damaged end fails in many ways; the walk finds what is lost
             return None
         return summary if summary is not None and summary.channels else None
 
     def _use_index(self, summary: Summary) -> None:
-        """Take the blocks from the index, and metadata from where it says."""
+        """Take the blocks from the index, and metadata from the place that it gives."""
         for chunk in summary.chunk_indexes:
             # Each channel has one record: its head, its own, and an entry for each message.
             heads = len(chunk.message_index_offsets) * (_RECORD_HEAD.size + _INDEX_HEAD_SIZE)

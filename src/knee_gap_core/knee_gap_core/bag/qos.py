@@ -45,5 +45,5 @@ def parse(text: str) -> tuple[Qos, ...]:
 
 
 def is_latched(profiles: Sequence[Qos]) -> bool:
-    """Tell whether every publisher kept its last message for those who come later."""
+    """Return whether every publisher kept its last message for those who come later."""
     return bool(profiles) and all(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in profiles)

@@ -20,7 +20,7 @@ _MOST_BYTES = 256 << 20
 
 
 class SqliteFile:
-    """The readable part of one file, in the form of `McapFile`. Raises BagError where it is none."""
+    """The readable part of one file, in the form of `McapFile`. Raises BagError if it is not one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -21,9 +21,10 @@ Parameters = TypeVar("Parameters")
 # Images: whatever the camera offers, and never a growing queue of old ones. Eight hold 133 ms at 60 Hz, which
 # a two-core machine needs to lose nothing when another process takes its turn.
 IMAGE_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
-# Trackers publish best effort or reliable; a best-effort subscription hears both. 64 poses: 0.5 s at 120 Hz.
+# Trackers publish best effort or reliable; a best-effort subscription receives both. 64 poses: 0.5 s at 120
+# Hz.
 TRACKER_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=64, reliability=ReliabilityPolicy.BEST_EFFORT)
-# What the suite says to itself and to a controller must arrive.
+# What nodes send to each other and to a controller must arrive.
 RESULT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=64, reliability=ReliabilityPolicy.RELIABLE)
 # A subscriber that comes late still gets the last one.
 LATCHED_QOS = QoSProfile(
@@ -47,7 +48,7 @@ class GuardedNode(Node):
         super().__init__(name)
 
     def recover(self, fault: Fault) -> None:
-        """Start the core afresh after a fault, and answer what it refused; a node that has a core does so."""
+        """Reset the core after a fault, and answer what it refused; a node that has a core does so."""
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *options: Any, **named: Any
@@ -84,11 +85,11 @@ class GuardedNode(Node):
         return super().create_service(srv_type, srv_name, guarded, *options, **named)
 
     def guarded(self, what: str, callback: Callable[..., None]) -> Callable[..., None]:
-        """A callback that raises nothing: what it would raise refuses `what`, and the core starts afresh."""
+        """A callback that raises nothing: what it would raise refuses `what`, and the core is reset."""
         return self.seam.guarded(what, lambda fault, *_: self._recover(fault), callback)
 
     def _recover(self, fault: Fault) -> None:
-        # What cannot even start afresh is counted too, and no reason to end either.
+        # A reset that fails is counted too, and does not end the node either.
         self.seam.call(f"recovery after {fault.what}", lambda _: None, lambda: self.recover(fault))
 
     def _on_fault(self, fault: Fault) -> None:
@@ -104,7 +105,7 @@ class GuardedNode(Node):
 
 
 class BaseNode(GuardedNode):
-    """A node whose parameters come from a dataclass and that says once a second how it fares."""
+    """A node whose parameters come from a dataclass and that reports its health once a second."""
 
     def __init__(self, name: str, *, health: Callable[[], Health]) -> None:
         with refused_by_ros():
@@ -146,7 +147,7 @@ class BaseNode(GuardedNode):
         self._diagnostics.publish(message)
 
     def watch_input(self, topic: str) -> None:
-        """Say in log and diagnostics where nobody publishes a topic that the node cannot do without."""
+        """Report in log and diagnostics if nobody publishes a topic that the node cannot do without."""
         self._inputs[self.resolve_topic_name(topic)] = 0
 
     def forget_input(self, topic: str) -> None:
@@ -174,7 +175,7 @@ def _is_interrupted(error: BaseException | None) -> bool:
 
 
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
-    """Start a node, spin until it is told to stop, return the exit code: 2 for a mistake of the user's."""
+    """Start a node, spin until it is stopped, return the exit code: 2 for a mistake of the user's."""
     try:
         require_files(sys.argv if argv is None else argv)
         rclpy.init(args=None if argv is None else list(argv))

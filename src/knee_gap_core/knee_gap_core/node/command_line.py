@@ -89,7 +89,7 @@ class _Pace:
 
     @property
     def rate(self) -> str:
-        """Recorded time by time passed; empty where it is not known."""
+        """Recorded time by time passed; empty if it is not known."""
         passed = time.monotonic() - self._begun
         if not self._recorded_ns or passed <= 0.0:
             return ""

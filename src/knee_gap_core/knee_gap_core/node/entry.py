@@ -30,7 +30,7 @@ def run_main(module: str, *, node: bool = False) -> int:
     for number in STOPS:
         # Nothing is open yet that would have to be closed; an exception would run through foreign imports.
         signal.signal(number, lambda stop, _frame: os._exit(0 if node else 128 + stop))
-    # Blocked by whoever started this process, so that a signal waits until it is understood.
+    # Blocked by the process that started this one, so that a signal waits until it can be handled.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     main: Callable[[], int] = import_module(module).main
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -4,4 +4,4 @@ from knee_gap_core.values.errors import KneeGapError
 
 
 class ConfigurationError(KneeGapError):
-    """A node cannot run as it was told to; the message says which rule, value and choices."""
+    """A node cannot start with what it was given; the message names the rule, the value and the choices."""

@@ -2,7 +2,7 @@
 
 Whatever a message is, a core answers it with a status or a reason. An exception is therefore a mistake of the
 program; but a node that dies of it leaves a controller without an answer, so it is refused and counted like a
-bad message, and the node goes on from a fresh start. With `KNEE_GAP_STRICT` set, as tests do, it is raised.
+bad message, and the node goes on with its core reset. With `KNEE_GAP_STRICT` set, as tests do, it is raised.
 """
 
 import functools
@@ -52,7 +52,7 @@ class Fault:
     def of(cls, what: str, error: Exception) -> "Fault":
         """The fault of an exception that was caught."""
         frames = traceback.extract_tb(error.__traceback__)
-        # The seam's own frames say nothing; those of libraries little.
+        # The seam's own frames do not help to find the fault; those of libraries little.
         own = [frame for frame in frames if OWN_FILES in frame.filename and frame.filename != __file__]
         frame = (own or frames)[-1]
         place = f"{os.path.basename(frame.filename)}:{frame.lineno}"
@@ -64,7 +64,7 @@ class Seam:
     """Calls into a core, and catches what it raises.
 
     `on_fault` is called with each fault, for the log; `counts` holds how often each came, by what was
-    refused and its reason. `passes` is whether an exception is none of a message, as that of a shutdown.
+    refused and its reason. `passes` is whether an exception is not of a message, such as that of a shutdown.
     `strict` raises all of them; by default as the environment has it.
     """
 
@@ -81,7 +81,7 @@ class Seam:
         self._passes = passes
 
     def call(self, what: str, otherwise: Callable[[Fault], Result], function: Callable[[], Result]) -> Result:
-        """What `function` returns; if it raises, what `otherwise` returns, which starts the core afresh."""
+        """What `function` returns; if it raises, what `otherwise` returns, which resets the core."""
         try:
             return function()
         except Exception as error:

@@ -100,7 +100,7 @@ def _fill_section(message: Any, section: SectionEdges) -> Any:
 
 
 def _camera_errors(message: Any) -> Floats:
-    """Errors (2, 3, k) of the camera; k is 0 where they are not known."""
+    """Errors (2, 3, k) of the camera; k is 0 if they are not known."""
     errors = np.array([message.camera_error_0, message.camera_error_1], dtype=float)
     errors = errors.reshape(2, 3, MOST_CAMERA_ERRORS)
     return errors[:, :, :0] if np.isnan(errors).all() else errors

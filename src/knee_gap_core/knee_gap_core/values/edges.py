@@ -141,14 +141,14 @@ class GapEdges:
         if any(self.hidden):
             return "a point is hidden in the image: its bearing is a prediction, not a measurement"
         if not (np.isfinite(self.bearings).all() and np.isfinite(self.covariances).all()):
-            return "the edges say valid and carry numbers that are not finite"
+            return "the edges are VALID, but have numbers that are not finite"
         if not np.isfinite(self.camera_errors).all():
-            return "the edges say valid and carry errors of the camera that are not finite"
+            return "the edges are VALID, but have errors of the camera that are not finite"
         if np.abs(np.linalg.norm(self.bearings, axis=1) - 1.0).max() > UNIT_TOLERANCE:
-            return "the edges say valid and carry bearings that are no unit vectors"
+            return "the edges are VALID, but have bearings that are not unit vectors"
         if not 0.0 <= self.angular_error < np.pi / 2:
-            return "the edges say valid and carry an angular error outside [0, pi/2)"
+            return "the edges are VALID, but have an angular error outside [0, pi/2)"
         if self.angular_error < (1.0 - ROUNDING) * np.sqrt(np.linalg.eigvalsh(self.covariances).max()):
-            # No error that is bounded has a standard deviation above its bound.
-            return "the edges say valid and carry an angular error below its own standard deviation"
+            # A bounded error has no standard deviation above its bound.
+            return "the edges are VALID, but have an angular error below its own standard deviation"
         return ""

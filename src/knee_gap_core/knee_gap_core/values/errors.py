@@ -9,11 +9,11 @@ class KneeGapError(ValueError):
 
 
 class MeasurementError(KneeGapError):
-    """No honest number can be given for these views."""
+    """These views do not allow a number."""
 
 
 class BadInputError(MeasurementError):
-    """A value that cannot be: not finite, not a unit vector, negative, of the wrong shape, not a choice."""
+    """An impossible value: not finite, not a unit vector, negative, of the wrong shape, not a choice."""
 
 
 class BaselineTooShortError(MeasurementError):
@@ -21,7 +21,7 @@ class BaselineTooShortError(MeasurementError):
 
 
 class EpipoleError(MeasurementError):
-    """A bearing lies along the travel, within the admitted error: it spans no triangle with it."""
+    """A bearing lies along the baseline, within the admitted error: it spans no triangle with it."""
 
 
 class CheiralityError(MeasurementError):
@@ -29,4 +29,4 @@ class CheiralityError(MeasurementError):
 
 
 class UnderconstrainedError(MeasurementError):
-    """The two rays to a point are parallel: it is at infinity, and no gap can be told."""
+    """The two rays to a point are parallel: it is at infinity, and the gap is unknown."""

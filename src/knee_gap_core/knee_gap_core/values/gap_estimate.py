@@ -25,7 +25,7 @@ class GapStatus(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class GapEstimate:
-    """One answer; the fields of knee_gap_msgs/GapEstimate, in metres and radians, NaN where unknown.
+    """The estimate at one image: the fields of knee_gap_msgs/GapEstimate [m, rad]; NaN where unknown.
 
     `points` (2, 3), `instrument_point` (3,) and `instrument_axis` (3,) are in the frame `frame_id`. `shares`
     (6,) divide the variance among image, lens position, lens rotation, common part, edges and shape.
@@ -61,5 +61,5 @@ class GapEstimate:
 
     @property
     def reason(self) -> str:
-        """Why the status is not VALID, in words; empty where it is."""
+        """Why the status is not VALID, in words; empty if it is."""
         return str(self.rejection) if self.rejection is not None else ""

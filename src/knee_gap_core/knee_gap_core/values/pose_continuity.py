@@ -180,6 +180,6 @@ def _difference(minuend: Vector, subtrahend: Vector, factor: float) -> Vector:
 
 
 def _length(vector: Vector) -> float:
-    """Length of a vector; infinite where it is none."""
+    """Length of a vector; infinite if it is not a number."""
     length = hypot(*vector)
     return length if length == length else inf

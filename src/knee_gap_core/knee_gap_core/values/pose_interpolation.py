@@ -1,6 +1,6 @@
-"""The pose of the lens at the stamp of an image, foretold where the tracker has not come so far yet.
+"""The pose of the lens at the stamp of an image: interpolated, or predicted beyond the tracker's last pose.
 
-An image may be looked at before the tracker's next pose arrives. What is foretold only guides the search
+An image may be looked at before the tracker's next pose arrives. A predicted pose only guides the search
 for the points in the image, so a pose with a larger, honest covariance is better than none.
 """
 
@@ -71,7 +71,7 @@ def lens_between(
 
 
 class LensPosePredictor:
-    """Takes lens poses in the order of their stamps and tells the pose at a stamp near the last of them."""
+    """Takes lens poses in the order of their stamps and returns the pose at a stamp near the last of them."""
 
     def __init__(self, longest_step_ns: int = LONGEST_STEP_NS) -> None:
         """`longest_step_ns`: the longest time between poses, and from the last to the stamp asked for."""
@@ -85,7 +85,7 @@ class LensPosePredictor:
         return self._continuity.reason
 
     def add(self, pose: LensPose) -> None:
-        """Take the next pose; one of another frame, or from before the last, starts anew."""
+        """Add the next pose; one of another frame, or from before the last, clears the earlier ones."""
         if self._poses:
             last = self._poses[-1]
             if pose.frame_id != last.frame_id or pose.stamp_ns <= last.stamp_ns:
@@ -150,7 +150,7 @@ class LensPosePredictor:
             end -= 1
         if end == 0:
             return []
-        # Between two poses those two tell most; beyond the last, more of them level the noise.
+        # Between two poses those two weigh most; beyond the last, more of them level the noise.
         wanted = 2 if self._poses[end - 1].stamp_ns >= stamp_ns else POSES
         motion = [self._poses[end - 1]]
         for index in range(end - 2, max(end - 1 - wanted, -1), -1):

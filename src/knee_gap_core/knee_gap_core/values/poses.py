@@ -20,9 +20,9 @@ class BodyPose:
     """One tracked rigid body at one exposure of the tracker's cameras.
 
     `position` (3,) [m] and `quaternion_xyzw` (4,) map body coordinates to the tracker's frame.
-    `tracking_valid` is the tracker's own word on whether it sees the body; `mean_error` the mean residual of
-    its markers [m], NaN where the tracker does not tell. `stamp_ns` is the time of exposure, or of arrival
-    where `stamp_is_arrival` says so. Nothing here is checked: `pose_validity` does that.
+    `tracking_valid` is whether the tracker reports that it sees the body; `mean_error` the mean residual of
+    its markers [m], NaN if the tracker does not report it. `stamp_ns` is the time of exposure, or of arrival
+    if `stamp_is_arrival`. Nothing here is checked: `pose_validity` does that.
     """
 
     stamp_ns: int

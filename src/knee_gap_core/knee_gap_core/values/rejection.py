@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 
 class Rejection(NamedTuple):
-    """A reason in constant words, which is counted, and the detail of this case; empty if there is none."""
+    """A reason in constant words, which is counted, and the detail of this case, which may be empty."""
 
     reason: StrEnum
     detail: str = ""
 
     def __str__(self) -> str:
-        """The detail, or the reason where there is none."""
+        """The detail, or the reason if there is none."""
         return self.detail or self.reason.value

@@ -1,7 +1,7 @@
 """The images and lens poses of one scope, as messages, to the edges in each image: segmentation_node but ROS.
 
 An image may wait a little for the lens pose that follows it, so that the pose at its stamp is interpolated
-and not foretold. It waits for nothing else, and not where no pose is to be expected.
+and not predicted. It waits for nothing else, and not where no pose is to be expected.
 """
 
 from collections import Counter, deque
@@ -68,12 +68,11 @@ class EdgeStream:
     """Takes messages by field name; whatever is wrong with one is a status, a reason and a count.
 
     Images are handed in by `on_image` and come out, in order, as edges from `ready`. With a `calibration` the
-    camera is its own, whatever camera_info says, and images of another size are refused. `by_notch`: the
-    notch is looked for in every image as it arrives, and there is one lens pose an image, which rests on it.
-    The scope is used in `medium`, and a camera that was calibrated in another is converted to it; that of
-    camera_info was calibrated in `camera_info_medium`.
-    Tracks are numbered from `first_track_id` on.
-    Raises PerceptionError for a calibration without a camera, or without the notch that is to be found.
+    camera is that of the calibration, not of camera_info, and images of another size are refused. `by_notch`:
+    the notch is looked for in every image as it arrives, and there is one lens pose an image, which rests on
+    it. The scope is used in `medium`, and a camera that was calibrated in another is converted to it; that of
+    camera_info was calibrated in `camera_info_medium`. Tracks are numbered from `first_track_id` on. Raises
+    PerceptionError for a calibration without a camera, or without the notch that is to be found.
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class EdgeStream:
         self._camera_flaw = NO_CAMERA
         self._camera_key: tuple[object, ...] = ()
         self.calibration = calibration
-        # Why the images are none of the calibration's; empty where they are.
+        # Why the images do not fit the calibration; empty if they do.
         self.size_flaw = ""
         self._camera_errors: CameraErrors | None = None
         if calibration is not None:
@@ -175,7 +174,7 @@ class EdgeStream:
     def on_image(self, message: Any, now_ns: int = 0) -> NotchObservation | None:
         """Take a sensor_msgs/Image or sensor_msgs/CompressedImage that arrives at a time [ns].
 
-        Returns where its notch is, for whoever needs it for the pose of the lens; None where nobody does.
+        Returns its notch, which the pose of the lens depends on; None if the notch is not followed.
         """
         stamp = stamp_ns(message.header)
         if self._notch is None:
@@ -200,7 +199,8 @@ class EdgeStream:
     def ready(self, now_ns: int = 0) -> Iterator[GapEdges]:
         """Edges of the images that need not wait at a time [ns]; each is looked at when it is asked for.
 
-        Until the next is asked for, `latest`, `reason`, `detector` and `overlay` speak of the one just given.
+        Until the next is asked for, `latest`, `reason`, `detector` and `overlay` are those of the one just
+        given.
         """
         while self._waiting:
             waiting = self._waiting[0]
@@ -227,7 +227,7 @@ class EdgeStream:
     def _must_wait(self, waiting: _Waiting, now_ns: int) -> bool:
         """Whether the lens pose after an image is still to be waited for."""
         waited_ns = now_ns - waiting.arrival_ns
-        # A clock that ran backwards tells nothing of the wait.
+        # A clock that ran backwards does not measure the wait.
         in_time = 0 <= waited_ns < self._wait_ns and len(self._waiting) <= MOST_WAITING
         return in_time and waiting.expects_pose and self._poses.expects_after(waiting.stamp_ns)
 
@@ -237,9 +237,9 @@ class EdgeStream:
             yield self._look(self._waiting.popleft())
 
     def recover(self, reason: str) -> list[GapEdges]:
-        """Start afresh after an exception: end the track and forget the lens poses, the camera stays.
+        """Reset after an exception: end the track and forget the lens poses; the camera stays.
 
-        Returns what is said of the image in whose course it came, if there was one.
+        Returns the edges reported for the image that raised it, if there was one.
         """
         self.detector.restart()
         self._poses.clear()
@@ -317,7 +317,7 @@ class EdgeStream:
             raise
 
     def choose(self, column: float, row: float) -> str:
-        """Begin anew at the gap nearest to a pixel of the last image; says why not, nothing if it is done."""
+        """Begin a track at the gap nearest to a pixel of the last image; return why not, empty if done."""
         if self._camera is None:
             return self._camera_flaw
         return self.detector.choose_near([column, row], self._camera)

@@ -39,7 +39,7 @@ class GapEdgeTracker:
     """Takes the images of one scope in order and returns the edges of the gap in each.
 
     The same images, stamps and poses give the same edges to the last bit. Nothing in the content of an image
-    raises: a status and `reason` tell what was wrong with it.
+    raises: its fault is a status and a `reason`.
     """
 
     def __init__(self, parameters: EdgeParameters | None = None, first_track_id: int = 1) -> None:
@@ -88,7 +88,7 @@ class GapEdgeTracker:
         return ended
 
     def restart(self) -> None:
-        """Forget the points, what was clicked, and what earlier images said of a gap."""
+        """Forget the points, what was clicked, and the evidence of a gap in earlier images."""
         self._clicked = None
         self._search.forget()
         self.end_track()
@@ -96,12 +96,12 @@ class GapEdgeTracker:
     def choose_at(self, pixel: npt.ArrayLike) -> None:
         """Start a new track at the section nearest to a clicked pixel (2,) of the next image."""
         self._clicked = np.asarray(pixel, dtype=np.float64)
-        # What was seen elsewhere says nothing of this place.
+        # What was seen elsewhere is no evidence for this place.
         self._search.forget()
         self.end_track()
 
     def choose_near(self, pixel: npt.ArrayLike, camera: Camera) -> str:
-        """As `choose_at`, if the last image shows a gap there; otherwise nothing changes, and it says why."""
+        """As `choose_at`, if the last image shows a gap there; otherwise return why not."""
         if self._image is None:
             return "no image received yet"
         clicked = np.asarray(pixel, dtype=np.float64)
@@ -134,7 +134,7 @@ class GapEdgeTracker:
     ) -> GapEdges:
         """The edges in an image (h, w, 3), blue green red, or (h, w) grey, exposed at a stamp [ns].
 
-        `lens_pose` is the pose of the lens at that stamp where it is known. It foretells where the points
+        `lens_pose` is the pose of the lens at that stamp if it is known. It predicts where the points
         are, through whatever hides them; where they are seen the image decides.
         """
         try:
@@ -178,7 +178,7 @@ class GapEdgeTracker:
                 f"the image has {image.shape[1]}x{image.shape[0]} px"
             )
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            # An image that comes twice tells nothing; stamps that run backwards are another recording.
+            # An image that comes twice adds nothing; stamps that run backwards are another recording.
             if stamp_ns == self._stamp_ns:
                 self._refuse("the image has the stamp of the one before")
             self.end_track()
@@ -250,7 +250,7 @@ class GapEdgeTracker:
         )
 
     def _settle_frame(self, pose_frame: str) -> None:
-        """Let the track be begun anew where it cannot use poses in a frame.
+        """Restart the track if it cannot use poses in a frame.
 
         It was begun without any, before the tracker's first pose or while the tracker saw nothing; or with
         poses in another frame, as when the reference body changes.
@@ -319,7 +319,7 @@ class GapEdgeTracker:
     def _follow(
         self, stamp_ns: int, grey: Image, camera: Camera, view: View | None, field: FieldOfView
     ) -> list[PointObservation]:
-        """Both points in the next image; ends the track, and says why, where they cannot be had."""
+        """Both points in the next image; ends the track, with the reason, if they cannot be followed."""
         assert self._track is not None
         observations = [point.follow(grey, camera, view) for point in self._track.points]
         if all(observation.seen for observation in observations):

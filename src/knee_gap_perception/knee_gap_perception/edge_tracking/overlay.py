@@ -29,7 +29,7 @@ def draw_overlay(
     `mask` (h, w) is 255 in the gap, or empty. The circle between the edges is the thickest that touches no
     tissue; a second one, green if it fits and red if not, has the angle `instrument` [rad] that an instrument
     spans at the section, NaN for none. The ellipses are drawn five times as large as three standard
-    deviations; the words tell the bound in degrees. Nothing is drawn of points that are not known.
+    deviations; the words give the bound in degrees. Nothing is drawn of points that are not known.
     """
     drawn = image.copy()
     # Sizes follow the image, so that words can be read at 480 and at 2160 rows.

@@ -56,13 +56,13 @@ class PoseParameters:
 
 @dataclass(frozen=True)
 class CameraInfoParameters:
-    """What camera_info speaks of. Raises PerceptionError for a medium that there is not."""
+    """The medium of camera_info. Raises PerceptionError for a medium that there is not."""
 
     camera_info_medium: str | float = field(
         default="air",
         metadata={
             "description": f"What the camera of camera_info was calibrated in: {CHOICES}; a calibration_file "
-            "tells its own"
+            "has its own"
         },
     )
 

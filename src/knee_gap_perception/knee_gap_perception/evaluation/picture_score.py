@@ -26,13 +26,13 @@ BESIDE = 0.01  # of the image's smaller side, by which a section's middle may mi
 class PictureScore:
     """What was found in a marked picture, against its marks.
 
-    `found` and `false` say whether two points were chosen across the marked gap, or elsewhere; in a place or
+    `found` and `false` are whether two points were chosen across the marked gap, or elsewhere; in a place or
     a picture marked as unclear neither. `on_instrument` counts points on an instrument or a drawn label.
     `dice` is that of the mask on scored pixels, NaN without a marked gap. `field_overlap` is the intersection
     over union with the marked field, 0 if none was found; `rim_error` the 95th percentile of the distance of
-    the marked rim from the found one, in its radii. Both are NaN if nothing is marked. `notch_marked` says
-    whether a notch is; `notch_error` [rad] is NaN unless one is found in such a picture; `notch_false` says
-    that one is found where none is marked. `reason` is why no points were chosen.
+    the marked rim from the found one, in its radii. Both are NaN if nothing is marked. `notch_marked` is
+    whether a notch is marked; `notch_error` [rad] is NaN unless one is found in such a picture; `notch_false`
+    is that one is found where none is marked. `reason` is why no points were chosen.
     """
 
     name: str

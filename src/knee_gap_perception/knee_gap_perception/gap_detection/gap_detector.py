@@ -56,7 +56,7 @@ class GapSearch:
     """
 
     def __init__(self, parameters: EdgeParameters) -> None:
-        """Raises PerceptionError if the segmentation cannot be loaded (an unreadable network, say)."""
+        """Raises PerceptionError if the segmentation cannot be loaded (such as an unreadable network)."""
         self.parameters = parameters
         self.confidence = float("nan")
         self._segmentation = segmentation_named(parameters.segmentation, **_settings(parameters))

@@ -22,7 +22,7 @@ LEAST_LIKENESS = 0.02  # [-] of textures that have nothing in common
 def likeness(correlation: float) -> float:
     """Share of the information on a shift that counts, of textures that correlate so.
 
-    The noise of both textures makes gradients that say nothing, and may lock onto each other. Found on the
+    The noise of both textures makes false gradients, which may lock onto each other. Found on the
     simulated knee, where what registrations add to the error was separated from what grows with the
     parallax: the variance goes as the inverse of the correlation beyond chance.
     """
@@ -91,7 +91,7 @@ def _fit_patch(
     prior_information[6, 6] = 1.0 / GAIN_PRIOR**2
     posterior = prior_information
     gain, deviation, converged = 1.0, np.zeros(7), False
-    # Where the noise makes gradients, they pull as much as true ones but say nothing. Near the end the
+    # Where the noise makes gradients, they pull as much as true ones but are false. Near the end the
     # true part of them is known, and only that counts.
     pixels, finishing = patch, 0
     for turn in range(MAXIMUM_ITERATIONS):

@@ -1,6 +1,6 @@
 """The inner loops of patch registration, compiled: passes over the pixels of a patch.
 
-Neighbouring pixels tell nearly the same: a patch holds every STEP-th pixel of every STEP-th line. Places in
+Neighbouring pixels are nearly the same: a patch holds every STEP-th pixel of every STEP-th line. Places in
 it are counted in pixels all the same.
 """
 

@@ -28,7 +28,7 @@ from knee_gap_perception.point_tracking.surface_kernel import (
 LOCAL_MEAN = 25  # [px] side of the window of the local mean and contrast
 ONE_SIDED, FULL_SIDED = 0.75, 0.97  # share of that window on the surface: from no weight to full
 SMOOTHING = 1.8  # [px] standard deviation: what is finer is noise
-FAINT = 0.004  # [-] contrast of detail added to the local one, where there is none
+FAINT = 0.004  # [-] contrast of detail added to the local one, if there is none
 NOISE_SHARE = 0.6  # of the pixels' noise added as well: noise must not look like texture
 DARK_OFFSET = 8.0  # [grey levels] added to the local mean: noise must not be blown up in the dark
 HIGHLIGHT = 1.15  # brightness against the tissue around from which a pixel loses weight
@@ -107,7 +107,7 @@ def surface_around(
     usual = max(median_on_surface(detail, surface), FAINT)
     specks = (detail > SPECK * usual).astype(np.uint8)
     clear = (surface > cv2.dilate(specks, np.ones((SPECK_RIM, SPECK_RIM), np.uint8))).astype(np.uint8)
-    # Noise of the pixels of the surface (Immerkaer 1996): the middle of the crop tells enough.
+    # Noise of the pixels of the surface (Immerkaer 1996): the middle of the crop is enough.
     noise = float(np.sqrt(np.pi / 2) / 6) * roughness(crop, surface)
     texture, weight = textures(
         smooth,

@@ -5,7 +5,7 @@ the first image's as long as the surface looks alike, then a patch taken at a la
 it inherits. So the error grows with the number of patches handed on (a few over a travel), not with the
 number of images.
 
-Where the pose of the lens is known it foretells, with the surface's tangent plane, where the patch will be
+If the pose of the lens is known it predicts, with the surface's tangent plane, where the patch will be
 and what shape it will have; otherwise the last image and even motion do.
 """
 
@@ -35,9 +35,9 @@ MILD = (
 FRESH = 0.80  # correlation above which a patch needs no successor
 GOOD = 0.70  # correlation from which a new patch may be taken
 CLEAR = 0.85  # share of the patch that must be seen, free of highlights, to take a new one
-FAIR = 0.42  # correlation below which the point is not seen, where the pose tells where it must be
-FAIR_WIDE = 0.52  # the same where the pose hardly tells, and the point is looked for all around
-WIDE = 6.0  # [px] standard deviation of the place that the pose tells, from which it hardly does
+FAIR = 0.42  # correlation below which the point is not seen, if the pose predicts where it must be
+FAIR_WIDE = 0.52  # the same if the pose predicts little, and the point is searched all around
+WIDE = 6.0  # [px] standard deviation of the predicted place, from which the prediction is weak
 FAIR_ALONE = 0.62  # the same without a pose: a highlight may carry the patch away
 REST = 8  # images for which a patch that was not found is not tried
 MINIMUM_SEEN = 0.35  # share of the patch
@@ -150,7 +150,7 @@ class PointTracker:
         return self._accept(best[0], best[1], predictions[best[0]], grey, view)
 
     def _find(self, patch: Patch, prediction: Prediction, grey: Image) -> Registration | None:
-        """The patch where it is predicted; None where nothing can be seen of it there.
+        """The patch where it is predicted; None if nothing can be seen of it there.
 
         Each prediction has a crop of its own: those of two patches may lie far apart, as after poses that
         were wrong, or that came back elsewhere.
@@ -200,7 +200,7 @@ class PointTracker:
         growth = 1.0 + self._unseen
         warp = Warp(self._warp.position + self._velocity, self._warp.shape @ np.linalg.inv(anchor.shape))
         covariance = np.diag([(MOTION_ERROR * growth) ** 2] * 2 + [(SHAPE_ERROR * growth) ** 2] * 4)
-        # What the last image did not tell about the point, this one has to.
+        # What the last image did not measure of the point, this one has to.
         known = anchor.covariance + self._drift(anchor.parallax)
         excess = float(np.linalg.eigvalsh(self._covariance - known)[-1])
         covariance[:2, :2] += max(excess, 0.0) * np.eye(2)

@@ -38,7 +38,7 @@ def _details(
 
 
 def _median_on_surface(values: Float32, surface: Float32) -> float:
-    """Median size of the values (h, w) on the surface; 0 where there is none."""
+    """Median size of the values (h, w) on the surface; 0 if there is none."""
     sparse = np.empty(values.size, np.float32)
     count = 0
     for i in range(0, values.shape[0], SPARSE):

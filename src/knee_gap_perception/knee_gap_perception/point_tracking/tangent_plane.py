@@ -19,8 +19,8 @@ DISTANCE_SPREAD = 0.6  # [-] standard deviation of the inverse distance, against
 SLOPE_SPREAD = 1.5  # [-] standard deviation of the tangent of the surface's slant
 SHAPE_NOISE = 0.03  # [-] of a patch's shape: the surface is not a plane
 MEMORY = 0.15  # [-] travel, against the distance, over which registrations are taken for one observation
-LEAST_TRAVEL = 0.01  # [-] travel, against the distance, from which a registration tells anything new
-FARTHEST_PX = 1e6  # [px] from the image, beyond which a prediction is none
+LEAST_TRAVEL = 0.01  # [-] travel, against the distance, from which a registration adds information
+FARTHEST_PX = 1e6  # [px] from the image, beyond which a prediction is not used
 DIFFERENCE = 4.0  # [px] between the points whose images give the shape
 
 
@@ -106,7 +106,8 @@ class TangentPlane:
 
         Registrations of one patch are wrong in the same way: by the light that moved, by relief that is no
         plane. They are no independent observations, however many images there are. So the plane forgets as
-        the lens travels, and takes in as much as it forgets: it knows what one registration from here tells.
+        the lens travels, and takes in as much as it forgets: it knows what one registration from here
+        measures.
         """
         lens = view.T_world_lens[:3, 3]
         moved = float(np.linalg.norm(lens - self._learnt_at) * np.linalg.norm(self.mean))

@@ -21,8 +21,8 @@ STEP = 2  # [px] between the pixels that are looked at
 class TissueTexture:
     """Texture of the square around a pixel, taken once for all places that are judged in it.
 
-    A place is judged by what a patch around it could tell about a shift, much as `Patch` would take it;
-    but what is a highlight is told from the light of the whole square.
+    A place is judged by how well a patch around it measures a shift, much as `Patch` would take it;
+    but highlights are found by the light of the whole square.
     """
 
     def __init__(self, grey: Image, centre: Array, reach: float, half_size: int, dark_below: float) -> None:
@@ -33,14 +33,14 @@ class TissueTexture:
         surface = surface_around(grey, centre, int(np.ceil(reach)) + half_size + MARGIN, dark_below)
         self._dx, self._dy = gradients(surface.texture)
         self._surface, self._half_size = surface, half_size
-        # Neighbours tell nearly the same.
+        # Neighbours are nearly the same.
         self._window = np.ascontiguousarray(patch_window(half_size)[::STEP, ::STEP])
 
     def information(self, pixel: Array, limit: float = float("inf")) -> tuple[Array, float]:
         """Structure tensor (2, 2) [1/px^2] at a pixel (2,), and the share of the patch there that is tissue.
 
         Only every other pixel of every other line is summed up. Of a block of the patch it takes no more than
-        `limit` times what the median block says. Raises PerceptionError for a pixel outside the square.
+        `limit` times that of the median block. Raises PerceptionError for a pixel outside the square.
         """
         corner = np.rint(pixel - np.array(self._surface.origin)) - self._half_size
         last = self._surface.weight.shape[0] - (2 * self._half_size + 1)

@@ -11,15 +11,15 @@ from knee_gap_core.values.poses import BodyPose, is_place
 MUCH_NEARER = 4.0
 # Two bodies are never this close [m], so a label that moved less has not been swapped.
 SEPARATION = 0.005
-# Where a body was so long ago [ns] says nothing about where it is.
+# A place so long ago [ns] does not limit where a body is now.
 FORGET_NS = 10_000_000_000
 
 
 class SwappedBodies:
     """Follows bodies by where they are, and compares that with what the tracker calls them.
 
-    Each frame is judged afresh from the last place of each body, so that a swap which began or ended unseen,
-    behind an occlusion, does not turn the names round for good.
+    Each frame is judged by itself from the last place of each body, so that a swap which began or ended
+    unseen, behind an occlusion, does not turn the names round for good.
     """
 
     def __init__(self) -> None:

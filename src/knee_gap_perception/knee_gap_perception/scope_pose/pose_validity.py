@@ -42,7 +42,7 @@ class RefusalReason(StrEnum):
 
 @dataclass(frozen=True)
 class Refusal:
-    """A pose that is not published as valid; `detail` says why in words, with the value and the limit."""
+    """A pose that is not published as valid; `detail` is the reason, with the value and the limit."""
 
     stamp_ns: int
     reason: RefusalReason
@@ -164,7 +164,7 @@ class PoseValidity:
             back = (previous - body.stamp_ns) / 1e9
             self.reset()
             self._stamp_ns = body.stamp_ns
-            return RefusalReason.STAMP_BACKWARDS, f"stamps went back by {back:.3f} s: starting afresh"
+            return RefusalReason.STAMP_BACKWARDS, f"stamps went back by {back:.3f} s: earlier poses dropped"
         if previous == body.stamp_ns:
             return RefusalReason.DUPLICATE, "the pose has the stamp of the one before it"
         if previous is not None:

@@ -1,4 +1,4 @@
-"""The leg as reference: the pose of the lens in a tracked body of the leg, so that a moving leg is none."""
+"""The leg as reference: the pose of the lens in the frame of a tracked body on the leg."""
 
 from dataclasses import replace
 

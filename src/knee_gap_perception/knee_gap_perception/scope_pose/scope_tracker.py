@@ -24,9 +24,9 @@ from knee_gap_perception.scope_rotation.notch_tracker import NotchObservation
 from knee_gap_perception.scope_rotation.rotated_poses import RotatedPoses, Tracked
 from knee_gap_perception.scope_rotation.shaft_axis import Mount
 
-# What says where the lens sits, unless a calibration does.
+# Parameters of the place of the lens, unless a calibration has it.
 NO_NOTCH_YET = (
-    "nobody tells of the notch: is scope_rotation_notch set for segmentation_node, and do images come?"
+    "no scope_notch received: is scope_rotation_notch set for segmentation_node, and do images arrive?"
 )
 PLACE_OF_LENS = ("body_to_shaft_translation", "body_to_shaft_quaternion_xyzw", "oblique_angle")
 
@@ -55,7 +55,7 @@ class TrackingParameters:
         default=(nan, nan, nan),
         metadata={
             "description": "Position of the lens in the tracked body, x y z [m]; NaN is not known, and then "
-            "a calibration_file has to tell",
+            "a calibration_file has to give it",
             "range": (-2.0, 2.0),
             "nan": True,
         },
@@ -110,7 +110,7 @@ class TrackingParameters:
         default="",
         metadata={
             "description": "Second tracked body, on an oblique scope whose camera head carries the first: it "
-            "tells how far the scope is turned; needs a calibration_file made with it; empty: not turned"
+            "shows how far the scope is turned; needs a calibration_file made with it; empty: not turned"
         },
     )
 
@@ -155,7 +155,7 @@ class ScopeTracker:
         *,
         by_notch: bool = False,
     ) -> None:
-        """`by_notch`: the notch in each image tells how far the scope is turned in its camera head.
+        """`by_notch`: the notch in each image shows how far the scope is turned in its camera head.
 
         Raises PerceptionError for settings that contradict each other, or the calibration.
         """
@@ -175,12 +175,12 @@ class ScopeTracker:
         self._clock_offset_ns = round(clock.offset * 1e9) if clock else 0
         self.turn = 0.0
         self._by_notch = RotatedPoses(self._lens_by_notch) if by_notch else None
-        # Why the latest image had no pose, where its notch was to tell the turn; empty where it had one.
+        # Why the latest image had no pose, if its notch is needed for it; empty if it had one.
         self.notch_flaw = NO_NOTCH_YET if by_notch else ""
 
     @property
     def by_notch(self) -> bool:
-        """Whether the notch in each image tells how far the scope is turned."""
+        """Whether the rotation of the scope is taken from the notch in each image."""
         return self._by_notch is not None
 
     @property
@@ -205,7 +205,7 @@ class ScopeTracker:
 
         None where the body is sound and the pose waits for the notch of an image.
 
-        `others` are the other bodies of the same frame of the tracker, if it tells them: a body that has
+        `others` are the other bodies of the same frame of the tracker, if it has any: a body that has
         swapped its label with one of them is refused. The reference body, if there is to be one, must be
         among them and as sound as the scope.
         """
@@ -232,7 +232,7 @@ class ScopeTracker:
         return self._lens_pose(tracked, self.turn, 0.0)
 
     def reset(self) -> None:
-        """Start afresh, as after a change of the set-up; the counts go on."""
+        """Forget all poses, as after a change of the set-up; the counts go on."""
         self.validity.reset()
         self.reference_validity.reset()
         self.turn_validity.reset()
@@ -349,11 +349,11 @@ def _fault(
 def _refuse_contradictions(
     parameters: TrackingParameters, calibration: Calibration | None, *, by_notch: bool
 ) -> None:
-    """Raise PerceptionError where two settings say different things of the lens, or one needs another."""
+    """Raise PerceptionError if two settings contradict each other, or one needs another."""
     placed = not any(isnan(number) for number in parameters.body_to_shaft_translation)
     if by_notch and parameters.scope_rotation_body:
         raise PerceptionError(
-            "scope_rotation_notch and scope_rotation_body both say how far the scope is turned: leave one "
+            "scope_rotation_notch and scope_rotation_body both measure the scope's rotation: leave one "
             "of them out"
         )
     if calibration is None:
@@ -376,7 +376,7 @@ def _refuse_contradictions(
     given = [PLACE_OF_LENS[0], *others] if placed else others
     if given:
         raise PerceptionError(
-            f"calibration_file says where the lens is, and so do {', '.join(given)}: leave one of them out"
+            f"the place of the lens is in calibration_file and in {', '.join(given)}: leave one of them out"
         )
     oblique = calibration.oblique
     by_body = oblique is not None and oblique.T_head_scope is not None and oblique.axis is not None

@@ -1,7 +1,7 @@
 """The notch at the border of the field of view, by which a surgeon sees how an oblique scope is turned.
 
 It is a part of the field stop: of one shape, at the border, with lit tissue on either side and before its
-tip. The gap may run to the border as well, but is dark before it, and a border that does not show tells
+tip. The gap may run to the border as well, but is dark before it, and a border that does not show gives
 nothing.
 """
 
@@ -26,7 +26,7 @@ ALIKE = (0.65, 1.45)  # of the known shape's depth and width
 NOTCH_SIGMA = np.radians(0.1)  # of an angle found: it was below 0.05 deg on rendered pictures, real notches
 # are blunter
 MIN_LEAD = 2.0  # times the area of the next candidate, where the shape is not known
-FOOT = 1.0 / 3.0  # of the depth, at which the width is told
+FOOT = 1.0 / 3.0  # of the depth, at which the width is measured
 
 
 class Notch(NamedTuple):
@@ -100,11 +100,11 @@ def common_shape(seen: Sequence[Notch | None]) -> NotchShape | None:
 
 
 def _notch(border: Border, side: float, run: npt.NDArray[np.intp]) -> Notch | None:
-    """The notch whose border leaves the circle in a run of directions; None where it is none."""
+    """The notch whose border leaves the circle in a run of directions; None if it is not a notch."""
     depths = border.depth
     depth = side * depths[run]
     peak = float(depth.max())
-    # Of a tip that is one direction wide the neighbours say how deep it is.
+    # Of a tip that is one direction wide the neighbours give its depth.
     if not MIN_DEPTH <= peak <= MAX_DEPTH:
         return None
     width = _width(side * depths, int(run[int(depth.argmax())]), FOOT * peak)

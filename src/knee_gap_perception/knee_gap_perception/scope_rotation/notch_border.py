@@ -53,7 +53,7 @@ class Border:
     """How far the border reaches into the field (STEPS,), in its radii; NaN where it does not show.
 
     Direction i is the angle i * STEP about `centre` (2,) [px], from the image's x to its y. 0 is the circle
-    through the border itself, of `radius` [px]. `solid` (STEPS,) says whether all is lit inside it, as far as
+    through the border itself, of `radius` [px]. `solid` (STEPS,) is whether all is lit inside it, as far as
     the band goes.
     """
 
@@ -64,7 +64,7 @@ class Border:
 
 
 def find_border(image: npt.NDArray[np.uint8], field: FieldOfView) -> Border | None:
-    """The border in an image (h, w, 3); None where too little of it shows to tell its circle.
+    """The border in an image (h, w, 3); None if too little of it shows to find its circle.
 
     A direction that shows no tissue just inside, as where the gap runs to the border, has no border.
     """
@@ -113,7 +113,7 @@ def _reach(
     dark, bright = light[every, before].astype(np.float64), light[every, first].astype(np.float64)
     share = np.clip((level - dark) / np.maximum(bright - dark, 1.0), 0.0, 1.0)
     reach = _RADII[before] + share * (_RADII[first] - _RADII[before])
-    # Light that is cut by the frame's side, rather than by the field stop, says nothing of the border.
+    # Light that is cut by the frame's side, rather than by the field stop, does not show the border.
     reach[~inside[every, before] | (first == 0)] = np.nan
     return np.asarray(reach), lit.sum(axis=1) >= SAMPLES - first - DARK_SAMPLES
 
@@ -121,7 +121,7 @@ def _reach(
 def _about_its_circle(
     reach: Array, solid: npt.NDArray[np.bool_], centre: tuple[float, float], radius: float
 ) -> Border | None:
-    """The border told from the circle on which most of it lies."""
+    """The border found from the circle on which most of it lies."""
     known = np.flatnonzero(np.isfinite(reach))
     if len(known) < FEWEST_ON_CIRCLE * STEPS:
         return None

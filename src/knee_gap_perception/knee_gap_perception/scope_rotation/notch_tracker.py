@@ -1,4 +1,4 @@
-"""The notch of one scope through its images: seen where it is sure, and said not to be seen anywhere else."""
+"""The notch of one scope through its images: reported as seen only if it is sure."""
 
 from dataclasses import dataclass
 from math import nan
@@ -25,7 +25,7 @@ NOT_SURE = "what looks like the notch has not been there for long enough"
 class NotchObservation:
     """Where the notch is in the image of a stamp: `angle` and its standard error [rad], NaN if not seen.
 
-    `reason` says why it is not seen, empty where it is. The angle is that of `Notch`.
+    `reason` is why it is not seen, empty if it is. The angle is that of `Notch`.
     """
 
     stamp_ns: int
@@ -63,7 +63,7 @@ class NotchFollower:
         near = [notch for notch in found if self._within_reach(stamp_ns, notch)]
         if not near:
             if self._observations < OBSERVATIONS_TO_BEGIN:
-                # Nothing was sure yet: begin anew with what is there now.
+                # Nothing was sure yet: begin again with what is there now.
                 self._last, self._observations = None, 0
                 near = found
             if not near:

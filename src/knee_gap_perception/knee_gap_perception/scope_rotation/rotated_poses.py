@@ -1,8 +1,8 @@
-"""Poses of a lens whose scope is turned in its camera head, at the images whose notch tells by how much.
+"""Poses of a lens whose scope is turned in its camera head, at the images whose notch shows by how much.
 
 The tracker's poses come several times between two images, and how far the scope is turned is known at the
 images alone. So there is one pose of the lens an image, at its stamp, from the tracked poses on either side
-and the turn in that image itself: nothing is foretold, and an image without its notch has no pose.
+and the turn in that image itself: nothing is predicted, and an image without its notch has no pose.
 """
 
 from collections import deque
@@ -49,13 +49,13 @@ class RotatedPoses:
         self._newest_observation_ns = 0
 
     def add_tracked(self, tracked: Tracked) -> None:
-        """Take the bodies of the tracker's next frame; from before the last, they start anew."""
+        """Take the bodies of the tracker's next frame; one from before the last clears the earlier ones."""
         if self._tracked and tracked.stamp_ns <= self._tracked[-1].stamp_ns:
             self.clear()
         self._tracked.append(tracked)
 
     def add_observation(self, observation: NotchObservation) -> None:
-        """Take the notch of the next image; from before the last, the images start anew."""
+        """Take the notch of the next image; one from before the last clears the earlier ones."""
         if observation.stamp_ns <= self._newest_observation_ns:
             self._observations.clear()
         self._newest_observation_ns = observation.stamp_ns

@@ -135,7 +135,7 @@ def _first_pictures(bag: CalibrationBag, topic: str, wanted: set[int]) -> dict[i
 
 
 def mask_files(folder: Path) -> dict[Path, Path]:
-    """Images of a folder by their path in it without suffix. Raises PerceptionError if it is none."""
+    """Images of a folder by their path in it without suffix. Raises PerceptionError if it is not one."""
     if not folder.is_dir():
         raise PerceptionError(f"{shown(folder)} is not a folder")
     return {

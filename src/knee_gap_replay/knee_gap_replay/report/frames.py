@@ -27,7 +27,7 @@ _NO_MASK = np.zeros((0, 0), np.uint8)
 
 
 class Frame(NamedTuple):
-    """A picture as JPEG, empty if the image cannot be read (`flaw` says why)."""
+    """A picture as JPEG, empty if the image cannot be read; `flaw` is the reason."""
 
     stamp_ns: int
     jpeg: bytes

@@ -23,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 _OTHER_CLOCK_NS = 3_600 * 1_000_000_000
 # A stream pauses where two stamps lie farther apart than this many periods.
 _PAUSE_PERIODS = 1.5
-# Kinds of messages that cannot be read, of which a page speaks.
+# Kinds of unreadable messages that a page reports.
 _MOST_REMARKS = 5
 _NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")
 

@@ -27,13 +27,13 @@ class ReplayClock(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What to say of it."""
+        """The clock in words."""
         rate = f" at {1.0 / self.pace:.2g} times its rate" if self.pace != 1.0 else ""
         return f"replayed{rate}"
 
 
 def replay_clock(topics: Sequence[tuple[Times, Times]]) -> ReplayClock | None:
-    """Return the clock of a replay from the recording times and stamps of its topics; None where it is none.
+    """Return the clock of a replay from the recording times and stamps of its topics; None if it is live.
 
     The message that took the shortest time is taken to have taken none. All `topics` are of one clock.
     """

@@ -149,7 +149,7 @@ class MeshKnee:
         return origin + lengths[:, None] * directions, normals, surfaces, lengths
 
     def surface_points(self, T_scene_lens: Array, bearings: Array, probe: Array | None = None) -> Array:
-        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN where there are none."""
+        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN if there are none."""
         return self.cast(T_scene_lens[:3, 3], bearings @ T_scene_lens[:3, :3].T, probe)[0]
 
     def looks_into_gap(

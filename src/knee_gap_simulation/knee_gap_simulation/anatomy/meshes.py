@@ -78,7 +78,7 @@ def read_meshes(folder: Path, unit: str = "m") -> KneeMeshes:
         found[role] = path
     for role in ("femur", "tibia"):
         if role not in found:
-            raise SimulationError(f"{folder} holds no mesh (STL, PLY, OBJ) whose name says '{role}'")
+            raise SimulationError(f"{folder} holds no mesh (STL, PLY, OBJ) whose name contains '{role}'")
     surfaces = {role: _read(path, UNITS[unit]) for role, path in found.items()}
     _check_size(surfaces["femur"], found["femur"], unit)
     for role, surface in surfaces.items():

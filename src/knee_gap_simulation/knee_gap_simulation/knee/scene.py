@@ -156,7 +156,7 @@ class KneeScene:
         return result
 
     def surface_points(self, T_scene_lens: Array, bearings: Array, probe: Array | None = None) -> Array:
-        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN where there are none."""
+        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN if there are none."""
         directions = bearings @ T_scene_lens[:3, :3].T
         return self.cast(T_scene_lens[:3, 3], directions, probe)[0]
 

@@ -1,4 +1,4 @@
-"""Statistics of pictures of a joint, and how well a simple classifier tells renders from real ones."""
+"""Statistics of pictures of a joint, and how well a simple classifier separates renders from real ones."""
 
 from collections.abc import Sequence
 

@@ -78,7 +78,7 @@ def edge_contacts(scene: Scene, T_scene_lens: Array, edge_bearings: npt.ArrayLik
     first, second = (0, 1) if straight else (1, 0)
     missed = max(float(off_0[first]), float(off_1[second]))
     if missed > _MOST_MISSED:
-        raise SimulationError(f"an edge lies {np.degrees(missed):.1f} degrees off all tissue: it is none")
+        raise SimulationError(f"an edge lies {np.degrees(missed):.1f} degrees off all tissue: not an edge")
     return np.stack([points_0[first], points_1[second]])
 
 

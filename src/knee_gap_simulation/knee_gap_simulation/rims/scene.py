@@ -111,7 +111,7 @@ class RimScene:
         return points, normals, uv, surfaces
 
     def surface_points(self, T_scene_lens: Array, bearings: Array) -> Array:
-        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN where there are none."""
+        """Points (n, 3) of the scene behind bearings (n, 3) of a lens; NaN if there are none."""
         directions = bearings @ T_scene_lens[:3, :3].T
         return self.cast(T_scene_lens[:3, 3].copy(), np.ascontiguousarray(directions))[0]
 

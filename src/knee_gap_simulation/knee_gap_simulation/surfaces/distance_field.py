@@ -3,7 +3,7 @@
 Scene frame: x along the gap, y across it (the femur is at negative y), z away from the lens. All lengths in
 metres. ``shape`` is the flat array of `KneeScene.constants`, ``waves`` its sine waves (n, 6), sorted by
 surface: surface, amplitude, wave vector [cycles/m], phase [cycles]; ``probe`` the joints (k, 4) of the
-probe, x y z and radius, empty where there is none.
+probe, x y z and radius, empty if there is none.
 """
 
 import numpy as np

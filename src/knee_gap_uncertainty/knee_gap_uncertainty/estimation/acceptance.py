@@ -1,4 +1,4 @@
-"""Acceptance of an estimate: one ordered table of rules, the first broken one says why it is not VALID.
+"""Acceptance of an estimate: one ordered table of rules, the first broken one is why it is not VALID.
 
 A rule is a reason, the status that it gives, a predicate over the facts that are known of an image, and what
 may still be reported if it is broken. An image is judged again as more becomes known of it (edges, pose,
@@ -255,7 +255,7 @@ RULES: tuple[Rule, ...] = (
 
 
 class Verdict(NamedTuple):
-    """The status of an image that breaks a rule, why, and what may still be told of it."""
+    """The status of an image that breaks a rule, why, and what may still be reported of it."""
 
     status: GapStatus
     rejection: Rejection

@@ -1,7 +1,7 @@
 """The estimator: posed observations of the two edges go in, estimates with bounds come out.
 
 The live node, the offline processing of a bag and the simulation run this same object; only what feeds it
-differs. It waits for nothing and reads no clock: whoever feeds it says when each message arrived, and
+differs. It waits for nothing and reads no clock: its caller states when each message arrived, and
 calls `advance` when time passes without one.
 """
 
@@ -35,7 +35,7 @@ from knee_gap_uncertainty.scope_calibration.scope_calibration import (
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
-# Of calibrations: what a network says must not grow without end.
+# Of calibrations: what arrives from a network must not grow without end.
 MOST_NODES = 8
 # Advice, and profiles, that nobody has taken yet.
 MOST_ADVICE = 16
@@ -66,7 +66,8 @@ class GapEstimator:
         self.latest: GapEstimate | None = None
         self._poses = PoseBuffer(max_pose_age=self.parameters.max_pose_age)
         self._turns = ScopeRotations(self.parameters.max_pose_age)
-        # Whether a turn was ever told: it is followed then, and an image without one is of an unknown scope.
+        # Whether a rotation was ever reported: it is followed then, and an image without one is of an unknown
+        # scope.
         self._rotation_reported = False
         self._pending: deque[Pending] = deque()
         self._track: Track | None = None
@@ -79,7 +80,7 @@ class GapEstimator:
         self.calibration_flaw = ""
         self._calibration_error = shared_error((), self.parameters)
         self._frame_id = ""
-        # Whether stamps are held to the clock of whoever feeds this: live they are of the same time.
+        # Whether stamps are compared with the caller's clock: live they are of the same time.
         self._is_live = False
         # By how much the clock was ahead of the stamps of the latest poses: what an image's delay is held to.
         self._delays = DelayFloor()
@@ -127,9 +128,9 @@ class GapEstimator:
             self.counts[f"leg body refused: {refusal.value}"] += 1
 
     def add_calibration(self, reported: ScopeCalibration) -> None:
-        """Take what a node says of its calibration.
+        """Add the calibration that a node reports.
 
-        Where nodes contradict each other, or tell an error that is none, nothing is valid.
+        If nodes contradict each other, or report an impossible error, nothing is valid.
         """
         known = self.calibrations.get(reported.node)
         if known is None and len(self.calibrations) == MOST_NODES:
@@ -200,7 +201,7 @@ class GapEstimator:
         return self._without(estimate.stamp_ns, estimate.track_id, verdict) if verdict else estimate
 
     def _silent(self, now_ns: int) -> GapEstimate:
-        """Statement that no image comes."""
+        """The estimate that reports that no image comes."""
         self._silence.report(now_ns)
         last = self._last_edges
         # The only stamp that is not an image's: no image came, and the statement needs a time.
@@ -210,9 +211,9 @@ class GapEstimator:
         return self._without(max(stamp_ns, 0), 0, verdict)
 
     def recover(self, reason: str) -> list[GapEstimate]:
-        """Start afresh after an exception: end the track and forget the poses; calibrations stay.
+        """Reset after an exception: end the track and forget the poses; calibrations stay.
 
-        Returns what is said of the image whose turn it was, if one waited.
+        Returns the estimate reported for the image that was due, if one waited.
         """
         self._track = None
         self._poses.clear()
@@ -278,7 +279,7 @@ class GapEstimator:
         return self._measure(facts, edges, replace(facts.pose, scope_rotation=facts.turn))
 
     def _rotation_is_followed(self) -> bool:
-        """Whether somebody tells, or says that he will, how far the scope is turned in its camera head."""
+        """Whether the rotation of the scope in its camera head is reported, or announced."""
         return self._rotation_reported or any(one.rotation_followed for one in self.calibrations.values())
 
     def _measure(self, facts: Facts, edges: GapEdges, pose: LensPose) -> GapEstimate:
@@ -337,7 +338,7 @@ class GapEstimator:
         return self._track.situation if self._track is not None else None
 
     def _without(self, stamp_ns: int, track_id: int, verdict: Verdict) -> GapEstimate:
-        """An estimate that says why there is no number."""
+        """An estimate without numbers, with the reason."""
         return self._count(
             GapEstimate(
                 stamp_ns,

@@ -35,7 +35,7 @@ class LegBody:
         return refusal
 
     def flaw(self, stamp_ns: int, frame_id: str) -> str:
-        """Why the body says nothing of an image and a lens pose in `frame_id`, in words; empty if it does."""
+        """Why the body cannot be used at an image with a lens pose in `frame_id`; empty if it can."""
         if self.pose is None:
             return "no pose of the leg body arrives"
         if self.pose.frame_id != frame_id:

@@ -26,7 +26,7 @@ class PoseRefusal(StrEnum):
     """Why a pose is not kept, or why there is none at a stamp."""
 
     NOT_FINITE = "the lens pose has numbers that are NaN or infinite"
-    NO_ERROR = "the lens pose's covariance is 0, which means unknown, or is none"
+    NO_ERROR = "the lens pose's covariance is 0, which means unknown, or is not a covariance"
     NOT_UNIT = "the lens pose's quaternion is not of length 1"
     DUPLICATE = "the lens pose has the stamp of the one before it"
     FROZEN = "the lens pose repeats an old one bit by bit under new stamps"
@@ -150,7 +150,7 @@ class PoseBuffer:
         return self._poses[found]
 
     def _near(self, index: int) -> LensPose:
-        """The pose that tells the velocity at that of an index, before or after it; itself if none is near.
+        """The pose that gives the velocity at that of an index, before or after it; itself if none is near.
 
         They are at most as far apart as the two around a stamp may be.
         """
@@ -197,6 +197,6 @@ def _refusal(pose: LensPose) -> PoseRefusal | None:
 
 
 def _has_error(pose: LensPose) -> bool:
-    """Whether a pose says how wrong it is: zeros are the message's default, and no tracker is perfect."""
+    """Whether a pose states its error: zeros are the message's default, and no tracker is perfect."""
     variances = np.diag(pose.covariance)
     return bool(np.all(variances[:3] > 0.0) and np.all(variances[3:] >= 0.0))

@@ -1,4 +1,4 @@
-"""How far an oblique scope was turned in its camera head at an image, from what was told beside its poses."""
+"""Rotation of an oblique scope in its camera head at an image, from the rotations reported with its poses."""
 
 from bisect import bisect_left
 from collections import deque
@@ -36,7 +36,7 @@ class ScopeRotations:
         self._age_ns = round(max_age * 1e9)
 
     def add(self, reported: ScopeRotation) -> RotationRefusal | None:
-        """Take a turn, or return why not; one before the last (a bag that starts again) begins anew."""
+        """Add a rotation, or return why not; one before the last (a bag starts again) clears the rest."""
         if not isfinite(reported.turn):
             return RotationRefusal.NOT_FINITE
         if abs(reported.turn) > 2.0 * pi:

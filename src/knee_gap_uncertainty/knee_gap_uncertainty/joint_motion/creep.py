@@ -21,7 +21,7 @@ from knee_gap_uncertainty.numerics.small_matrix import cholesky, solve_factored
 # Of the information on a rate: in a direction of which nothing is known, rounding is left.
 RIDGE = 1e-6
 # Of the information on an inverse depth that is due to errors of the lens positions: beyond it the travel is
-# too short to tell a rate.
+# too short to measure a rate.
 LARGEST_CORRECTED_SHARE = 0.02
 TINY = 1e-9  # [m/s]
 # What is possible is that many deviations.
@@ -88,7 +88,7 @@ def creep_statistic(
     reach = cross @ covariance
     left = score - reach @ corrected.score
     known = information - reach @ cross.T
-    # What is corrected is known only as well as so many squares of an error tell its variance.
+    # What is corrected is known only as well as so many squares of an error determine its variance.
     wrong = ridge * length / span * np.sqrt(2.0 / count)
     noise = known + ridge * information + wrong**2 * (information @ information)
     nearest = max(abs(unknowns[0, 2]), abs(unknowns[1, 2]), 1.0)

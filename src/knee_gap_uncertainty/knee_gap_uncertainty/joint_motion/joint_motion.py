@@ -1,7 +1,7 @@
 """Whether the two points stand still, as the analysis assumes: tested on the residuals of every image.
 
-`motion_statistics` says how far the residuals are from those of points at rest; here that is judged, image by
-image.
+`motion_statistics` measures how far the residuals are from those of points at rest; here that is judged,
+image by image.
 """
 
 from enum import Enum
@@ -30,7 +30,7 @@ LARGEST_CREEP = 20.0
 
 
 class Finding(Enum):
-    """What the views say of the points."""
+    """Result of the test: whether the points are at rest."""
 
     STILL = "the points stand still"
     CONTRADICTION = "the present bearings contradict the track"
@@ -56,7 +56,7 @@ class JointMotionTest:
     def judge(self, views: Views, fitted: MultiViewFit | None, passing: Views | None = None) -> Finding:
         """Finding at the last of `views`, all earlier ones having been found still.
 
-        `fitted`: the fit over `views`, None where there is none; `passing`: a single view from just before
+        `fitted`: the fit over `views`, None if there is none; `passing`: a single view from just before
         the last that is not among them. A contradicting view must not be kept.
         """
         observed = observations(views)

@@ -33,10 +33,11 @@ LARGEST_PRESENT = 18.4
 # Views on either side of a jump: fewer may be a few bad edges, which the fit gates out.
 FEWEST_VIEWS_BESIDE_A_SHIFT = 3
 
-# Inverse depth where the data do not tell it [1/m]: from 2.5 mm to infinity within two deviations.
+# Inverse depth while the data do not determine it [1/m]: from 2.5 mm to infinity within two deviations.
 EXPECTED_INVERSE_DEPTH = 100.0
-# While the data do not tell the depth, weights allow for points as near as 8 mm. Nearer: fewer tracks end by
-# chance in their first images, but one that begins with wrong edges is no longer told from a right one.
+# While the data do not determine the depth, weights allow for points as near as 8 mm. Nearer: fewer tracks
+# end by chance in their first images, but one that begins with wrong edges is no longer distinguished from a
+# right one.
 NEAREST = 120.0
 SMALLEST_INVERSE_DEPTH = 2.0
 # Below so many views the fit gates nothing, and the present view may have pulled it far.
@@ -44,7 +45,7 @@ FEWEST_VIEWS_TO_TRUST_A_FIT = 8
 PASSES_WITHOUT_TRUST = 5
 # Squared residual of a view (4 degrees of freedom) beyond which its weight falls.
 LARGEST_FULL_WEIGHT = 13.3
-# Errors that are all larger than they were said to be are a matter of scale, up to this ratio of variances.
+# Errors that are all larger than stated are a matter of scale, up to this ratio of variances.
 LARGEST_SCALE = 4.0
 FEWEST_VIEWS_TO_SCALE = 10
 
@@ -64,7 +65,7 @@ class MotionStatistics(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """The arrays of N views, as in likelihood.Measured; `times` (N,) [s] are 0 where they are not known."""
+    """The arrays of N views, as in likelihood.Measured; `times` (N,) [s] are 0 if they are not known."""
 
     lens: Array
     bearings: Array
@@ -93,7 +94,7 @@ def motion_statistics(
 ) -> MotionStatistics:
     """Statistics of views, the last of which is the present one; all zero for a single view.
 
-    `fitted`: a fit over most of them, None where there is none; `rates` [m/s]: RMS rate of the creep that
+    `fitted`: a fit over most of them, None if there is none; `rates` [m/s]: RMS rate of the creep that
     is no contradiction, and deviation per axis of the creep of a body of which nothing is known.
     """
     count = len(observed.lens)
@@ -283,7 +284,7 @@ def _largest_shift(
                     variance[axis, other] = row[3 * n + other]
                     for k in range(10):
                         variance[axis, other] -= reach[k] * after.information[2 * n + other, k]
-                # Where the views cannot tell a shift from another depth nothing is left but rounding.
+                # If the views cannot distinguish a shift from another depth, only rounding is left.
                 known = known and variance[axis, axis] > 1e-6 * row[3 * n + axis]
             if not known:
                 continue

@@ -9,7 +9,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_uncertainty.multi_view.likelihood import Linearised
 from knee_gap_uncertainty.numerics.small_matrix import cholesky, invert_factored
 
-# Inverse depth where the data do not tell it [1/m]: from 2.5 mm to infinity within two deviations.
+# Inverse depth while the data do not determine it [1/m]: from 2.5 mm to infinity within two deviations.
 EXPECTED_INVERSE_DEPTH = 100.0
 INVERSE_DEPTH_DEVIATION = 150.0
 

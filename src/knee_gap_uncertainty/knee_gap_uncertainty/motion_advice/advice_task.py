@@ -64,7 +64,7 @@ class AdviceTask:
     def turn(self, latest: Situation | None, pieces: int = PIECES) -> MotionAdvice | None:
         """Do a few pieces of work; return the advice when it is complete.
 
-        `latest` is None where nothing can be advised; work on a track that has ended is dropped.
+        `latest` is None if nothing can be advised; work on a track that has ended is dropped.
         """
         if latest is None or (self._begun is not None and self._begun.track_id != latest.track_id):
             self._pieces = self._begun = self._done = None

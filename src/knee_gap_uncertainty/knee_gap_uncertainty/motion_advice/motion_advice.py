@@ -40,7 +40,7 @@ VIEW_SPACING = 0.2e-3
 MOST_NEW_VIEWS = 40
 # The other sense of the gap must be this much better before the advice turns round.
 TURN_ADVANTAGE = 0.2
-# So many times in a row a target must be out of reach, or back in it, before the advice says so.
+# So many times in a row a target must be out of reach, or back in it, before the advice reports it.
 CONFIRMATIONS = 2
 
 
@@ -240,7 +240,7 @@ def scan(
 ) -> Iterator[tuple[float, float, float] | None]:
     """Yield None after each evaluation, and at last (travel, best, best_travel).
 
-    A generator, so that whoever has images to answer in between can take the scan in pieces.
+    A generator, so that images can be answered between the pieces of the scan.
     """
 
     def reached(value: float) -> bool:

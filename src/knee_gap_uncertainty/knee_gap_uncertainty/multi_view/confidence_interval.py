@@ -31,8 +31,8 @@ RADIUS_TOLERANCE = 5e-3
 class ConfidenceInterval:
     """Where the gap lies in a share `level` of cases [m].
 
-    `upper` is infinite where the data do not bound the gap. `refused` says that the parallax is too small for
-    the level to hold, and `reason` why; `lower` is then still a bound, `upper` is infinite.
+    `upper` is infinite where the data do not bound the gap. `refused` is whether the parallax is too small
+    for the level to hold, and `reason` why; `lower` is then still a bound, `upper` is infinite.
     """
 
     lower: float
@@ -76,7 +76,7 @@ def interval_ends(
     move = bend.mean + (radius * radius - 1.0) * bend.skew
     if move == 0.0 or not (unknowns[0, 2] > 0.0 and unknowns[1, 2] > 0.0):
         return lower, upper
-    # The ends may not pass the gap. An ellipsoid that holds both points at one place says nothing of how far
+    # The ends may not pass the gap. An ellipsoid that holds both points at one place does not limit how far
     # they are apart at least.
     gap = gap_of(frames, unknowns)
     lower = min(max(lower + move, 0.0), gap) if lower > 0.0 else 0.0

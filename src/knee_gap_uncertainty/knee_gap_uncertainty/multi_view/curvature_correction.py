@@ -46,7 +46,7 @@ def radius_at(
 
     The surface holds all differences (3,) [m] of the length of `difference`, whose place on it is where the
     estimate is nearest; `covariance` (3, 3) [m^2] of the difference. Of each point, were it there: `margins`
-    (2,) says how many standard deviations of its inverse depth it lies inside the limit of acceptance and
+    (2,) is how many standard deviations of its inverse depth it lies inside the limit of acceptance and
     `slopes` (2,) the correlation of that inverse depth with the distance.
     """
     product = np.zeros(3)

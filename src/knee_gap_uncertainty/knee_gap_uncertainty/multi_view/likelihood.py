@@ -208,7 +208,7 @@ def is_depth_lost(unknowns: Array, out: Linearised) -> bool:
 def maximise(measured: Measured, used: Mask, unknowns: Array, out: Linearised, covariance: Array) -> float:
     """Gauss-Newton from `unknowns`, which it overwrites; a step that makes the fit far worse is halved.
 
-    Writes the inverse of the corrected information (6, 6), zero where there is none, and returns the sum of
+    Writes the inverse of the corrected information (6, 6), zero if there is none, and returns the sum of
     the squared weighted residuals.
     """
     factor = np.zeros((6, 6))

@@ -48,7 +48,7 @@ SCALE_RAMP = (1.5, 2.5)
 LARGEST_COMMON_SHARE = 1.0 - 1e-6
 # An inverse depth [1/m] below which a point is as good as at infinity.
 AT_INFINITY = 1e-6
-# Where nearly all of the error is common, residuals say nothing of its scale, however small they should be.
+# Where nearly all of the error is common, residuals do not show its scale, however small they should be.
 SMALLEST_EXPECTED_SHARE = 0.25
 
 
@@ -75,7 +75,7 @@ class MultiViewFit:
     beyond infinity. `covariance` (6, 6) [m^2] of both points. `unknowns` (2, 3) and `unknowns_covariance` (6,
     6): a [-], b [-] and inverse depth [1/m] of each point about `centre` (3,) [m] in `frames` (2, 3, 3), as
     in `likelihood`. `chi_square_ratio`: squared weighted residuals over their expectation [-], about 1 where
-    the errors are as they were said to be; `scale` >= 1: what the covariances were multiplied by because of
+    the errors are as large as stated; `scale` >= 1: what the covariances were multiplied by because of
     it. `used` (N, 2) is false for gated bearings; `residuals` (N, 2): their squared length in standard
     deviations. `shares` (4,): image, lens position, lens rotation and common part of the variance of the gap;
     they sum to 1, and are NaN where there is no gap. `bend`: how far a large common offset moves
@@ -311,7 +311,7 @@ def squared_residuals(out: Linearised, used: Mask, inverse: Array, residuals: Ar
 def _gate(residuals: Array, used: Mask, allowed: int) -> int:
     """Take the worst bearings out of use, those next to the worst at once; return how many.
 
-    The gate widens with the median of the residuals: errors that are all larger than they were said to be are
+    The gate widens with the median of the residuals: errors that are all larger than stated are
     a matter of scale, not outliers.
     """
     if allowed == 0:

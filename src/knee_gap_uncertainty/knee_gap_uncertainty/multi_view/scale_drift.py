@@ -3,13 +3,13 @@
 Light that moves with the scope, relief that is taken for a plane and a contour that slides let a followed
 point lag behind its parallax, or run ahead of it, by a share that stays much the same over a track. Bearings
 that are wrong by a share s of their parallax since the first view are without a contradiction the bearings of
-a point whose distance from the first lens is smaller by that share. No residual tells it, so it is
+a point whose distance from the first lens is smaller by that share. No residual shows it, so it is
 considered: each point's covariance grows along the ray from the first lens.
 
-How large that share is, the bearings' own covariances tell best: they differ between a rim and a contour, and
+How large that share is, the bearings' own covariances show best: they differ between a rim and a contour, and
 where little texture is shared it is the registrations themselves that are wrong in the same way. So of what
 the best single views leave open of a point's depth a share of the variance lasts, however many views there
-are; what the covariances do not tell comes on top.
+are; what the covariances do not contain is added.
 """
 
 from dataclasses import replace
@@ -20,10 +20,11 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, points_jacobian
 from knee_gap_uncertainty.multi_view.views import Views
 
-# [rad] by which a bearing would turn were its point at the first lens: below it a view tells no depth.
+# [rad] by which a bearing would turn were its point at the first lens: below it a view does not measure
+# depth.
 LEAST_TURN = 1e-4
-# Share of the views that may claim to tell a depth better: one whose error is said to be nothing must not
-# speak for all.
+# Share of the views that may claim to measure a depth better: one whose stated error is 0 must not count
+# for all.
 TOO_GOOD = 0.1
 
 
@@ -33,9 +34,9 @@ def with_scale_drift(
     """The fit with a drift in its covariances and in the common part of its shares.
 
     `first_lens` (3,) [m] is the lens of the track's first view; `drift` [-] the standard deviation of the
-    share that no covariance tells, independent in both points; `correlated_error_share` [-] the share of the
-    variance that the best of the `views` leave open and that lasts over a track. With none of both, and where
-    a point lies at infinity, the fit is returned as it is.
+    share that no covariance contains, independent in both points; `correlated_error_share` [-] the share of
+    the variance that the best of the `views` leave open and that lasts over a track. With none of both, and
+    where a point lies at infinity, the fit is returned as it is.
     """
     if not ((drift > 0.0 or correlated_error_share > 0.0) and np.isfinite(fit.points).all()):
         return fit
@@ -54,7 +55,7 @@ def single_view_drift(fit: MultiViewFit, views: Views, first_lens: Array) -> Arr
 
     `first_lens` (3,) [m] is the lens of the track's first view. A drift by a share s turns the bearing of a
     view by s times the ray from the first lens, across the bearing and against the distance; the bearing's
-    error beside that turn is unknown as well. It is the first decile over the views that tell any. At most
+    error beside that turn is unknown as well. It is the first decile over the views that measure any. At most
     1: with no parallax at all, nothing is known.
     """
     rays = fit.points - first_lens

@@ -97,7 +97,7 @@ def variance_shares(
     """(4,) shares of image, lens position, lens rotation and common part in the gap's variance, of sum 1.
 
     The estimate is linear in the residuals, x = H^-1 sum_i J_i^T W_i r_i, so the gap's gradient taken through
-    it says how far each error of each view moves the gap; every cause adds the variance of what it moves. NaN
+    it is how far each error of each view moves the gap; every cause adds the variance of what it moves. NaN
     where a point lies at or beyond infinity.
     """
     shares = np.full(4, np.nan)

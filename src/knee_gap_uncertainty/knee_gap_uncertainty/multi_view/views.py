@@ -10,7 +10,7 @@ from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.likelihood import complete_frame
 
 LONGEST_UNIT_VECTOR_DEVIATION = 1e-3
-# Beyond this standard deviation [rad] a bearing says nothing and the error model of small angles is void.
+# Beyond this standard deviation [rad] a bearing is useless and the error model of small angles is void.
 LARGEST_BEARING_DEVIATION = 0.5
 # Relative to the largest variance: what rounding may leave of an element that ought to be zero.
 ROUNDING = 1e-6
@@ -26,13 +26,13 @@ class Views:
     brought the bearings into this frame: an error common to the two bearings of a view. `common_share` [-]:
     share of the bearings' variance that is one and the same offset in all images, in the axes of the image.
     `lens_rotations` (N, 3, 3) takes lens coordinates (z optical axis, x right, y down) to the frame of the
-    points and so says which way those axes lie; without it the lens is taken to look at the middle of the gap
+    points and so defines those axes; without it the lens is taken to look at the middle of the gap
     and not to roll. `lens_motions` (N, 6) are its velocity [m/s] and turning [rad/s] in the frame of the
     points, by which the error of a clock moves it, from two poses `motion_times` (N,) [s] apart; None where
     they are not known. `camera_errors` (N, 2, 3, k) are displacements of the bearings [rad], one for each
-    error of the camera's own numbers, which all views share; None where there are none.
-    `scope_rotations` (N,) [rad] say how far the scope was turned in its camera head; None where it was not.
-    `times` (N,) [s] are the stamps of the images; None where they are not known.
+    error of the camera's own numbers, which all views share; None if there are none.
+    `scope_rotations` (N,) [rad] are how far the scope was turned in its camera head; None where it was not.
+    `times` (N,) [s] are the stamps of the images; None if they are not known.
 
     Raises BadInputError for the first value that breaks a rule.
     """

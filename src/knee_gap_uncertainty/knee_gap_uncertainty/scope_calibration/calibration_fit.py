@@ -16,7 +16,7 @@ from knee_gap_uncertainty.multi_view.views import Views
 from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError
 
 PASSES = 3  # of Gauss and Newton: a degree of turn is not small beside a tenth of it
-EXPECTED_DEPTH, DEPTH_SIGMA = 0.012, 0.02  # [m] of points, while the views do not tell it
+EXPECTED_DEPTH, DEPTH_SIGMA = 0.012, 0.02  # [m] of points, while the views do not determine it
 # Of the noise of a bearing: what a calibration does below that is not worth a fit.
 NEGLIGIBLE = 0.2
 
@@ -24,7 +24,7 @@ NEGLIGIBLE = 0.2
 class SharedError(NamedTuple):
     """One value of the error: `parts` (7 + k,) are shift [m], turn [rad], clock [s] and camera [-].
 
-    Shifts are told from `rotation` (3, 3), `motion` (6,) of one view, at which they are none: what moves all
+    Shifts are counted from `rotation` (3, 3), `motion` (6,) of one view, at which they are 0: what moves all
     lenses alike moves the points with them.
     """
 
@@ -35,7 +35,7 @@ class SharedError(NamedTuple):
     def taken_from(self, views: Views) -> Views:
         """The views as they would be without it.
 
-        Taking a clock's error from a lens puts the errors of the two poses that tell its velocity in.
+        Taking a clock's error from a lens puts the errors of the two poses that give its velocity in.
         """
         assert views.lens_rotations is not None
         motions = _motions(views)

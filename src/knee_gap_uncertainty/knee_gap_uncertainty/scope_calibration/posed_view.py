@@ -32,7 +32,7 @@ def posed_view(edges: GapEdges, pose: LensPose, tracker_bound: float, camera_err
     """View of `edges` from `pose`; tracked errors are bounded by `tracker_bound` times their RMS length.
 
     `camera_error` [-] is the relative standard error of a focal length that was not calibrated; it comes to
-    the errors of the camera that the edges state. Raises BadInputError for covariances that are none.
+    the errors of the camera that the edges state. Raises BadInputError for matrices that are not covariances.
     """
     rotation = Rotation.from_quat(pose.quaternion_xyzw)
     matrix = rotation.as_matrix()

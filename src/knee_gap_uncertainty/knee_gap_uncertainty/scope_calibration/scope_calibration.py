@@ -37,11 +37,11 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ScopeCalibration:
-    """What one node says of the calibration that it uses: the fields of knee_gap_msgs/ScopeCalibration.
+    """The calibration that one node reports: the fields of knee_gap_msgs/ScopeCalibration.
 
     `hash` is empty where it uses none. `lens_covariance` (6, 6) is that of a small shift [m^2] and a small
     rotation [rad^2] of the lens on its body, in the frame of the lens, `time_offset_error` [s] that of the
-    clock; all NaN where the node does not use them. `rotation_followed` says that it tells the turn of the
+    clock; all NaN where the node does not use them. `rotation_followed` is whether it reports the turn of the
     scope in its camera head with each pose.
     """
 
@@ -52,8 +52,8 @@ class ScopeCalibration:
     rotation_followed: bool = False
 
     def flaw(self) -> str:
-        """Why the error that is told cannot be one, in words; empty if it can."""
-        whose = f"the calibration's error that {self.node} tells"
+        """Why the reported error is impossible, in words; empty if it is not."""
+        whose = f"the calibration's error that {self.node} reports"
         seconds, covariance = self.time_offset_error, self.lens_covariance
         if not (np.isnan(seconds) or 0.0 <= seconds <= LARGEST_CLOCK_ERROR):
             return f"{whose} has a clock's error outside [0, {LARGEST_CLOCK_ERROR:g}] s"
@@ -168,8 +168,8 @@ class CalibrationError:
     def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
         """(6, 7 + k + 7): how far the points go with shift, rotation, clock, camera, drift and scale.
 
-        By weighted least squares on the bearings, as the fit. Positions are told from the last view's: what
-        moves all lenses alike moves the points with them, and their distance not at all.
+        By weighted least squares on the bearings, as the fit. Positions are counted from the last view's:
+        what moves all lenses alike moves the points with them, and their distance not at all.
         """
         rotations = views.calibrated_rotations
         motions = _motions(views)
@@ -223,7 +223,7 @@ def _seconds(views: Views) -> Array:
 
 
 def _camera_errors(views: Views) -> Array:
-    """(N, 2, 3, k) displacements of the bearings by the errors of the camera; k is 0 where none are told."""
+    """(N, 2, 3, k) displacements of the bearings by the errors of the camera; k is 0 if none are reported."""
     return np.zeros((len(views), 2, 3, 0)) if views.camera_errors is None else views.camera_errors
 
 

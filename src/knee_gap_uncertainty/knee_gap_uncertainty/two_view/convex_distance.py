@@ -2,7 +2,7 @@
 
 The clouds are samples of volumes that are very nearly convex (the frustum of a cone, blurred by the displaced
 lens), so where hulls meet, the two points of the gap may be one, and the smallest distance between samples
-says nothing; where hulls come far nearer than samples do, it says little. Decided by the point of the hulls'
+means nothing; if hulls come far nearer than samples do, it means little. Decided by the point of the hulls'
 difference that is closest to the origin (Gilbert, Johnson, Keerthi 1988).
 """
 

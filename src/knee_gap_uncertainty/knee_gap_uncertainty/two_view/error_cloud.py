@@ -29,7 +29,7 @@ SIN_PHI = np.sin(PHI)
 SPOKES = 2 * len(PHI)
 
 # Where a ray under admitted errors meets the other nowhere, its point is put this many travels away: no
-# distance is taken to it, but it tells which way the cloud goes on without end.
+# distance is taken to it, but it is the direction in which the cloud is unbounded.
 FAR = 1e3
 
 

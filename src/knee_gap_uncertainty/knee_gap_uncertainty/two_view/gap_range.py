@@ -182,7 +182,7 @@ def reversed_views(views: TwoViews) -> TwoViews:
 
 
 def checked_error(name: str, value: float, unit: str) -> float:
-    """The error as a float that is finite and not negative; BadInputError says what it is otherwise."""
+    """The error as a float that is finite and not negative; raises BadInputError with the value otherwise."""
     try:
         number = float(value)
     except (TypeError, ValueError):

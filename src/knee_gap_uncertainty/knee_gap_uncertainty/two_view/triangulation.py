@@ -15,7 +15,7 @@ from knee_gap_core.values.errors import CheiralityError, EpipoleError, Undercons
 from knee_gap_uncertainty.numerics.vectors import Vector, angle, cross, dot, norm, row, scale, vector
 from knee_gap_uncertainty.two_view.two_views import TwoViews
 
-# Angles closer to 0 or pi than this cannot be told from it in double precision.
+# Angles closer to 0 or pi than this cannot be distinguished from it in double precision.
 SMALLEST_ANGLE = 1e-9
 
 

@@ -71,7 +71,7 @@ def finite(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArr
 
 
 def unit_vectors(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """The value as (2, 3) unit vectors; BadInputError names the first that is none."""
+    """The value as (2, 3) unit vectors; BadInputError names the first that is not one."""
     bearings = finite(name, value, (2, 3))
     for n, length in enumerate(np.sqrt((bearings**2).sum(axis=1))):
         if not abs(length - 1) <= UNIT_TOLERANCE:

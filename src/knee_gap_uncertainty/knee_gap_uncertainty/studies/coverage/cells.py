@@ -60,12 +60,12 @@ class Cell:
 
     @property
     def assumed_share(self) -> float:
-        """Common share that the estimator is told."""
+        """Common share that is stated to the estimator."""
         return 0.5 if self.model == "share half" else SHARES[self.share]
 
     @property
     def assumed_scale(self) -> float:
-        """Factor of the standard deviation of the bearings that the estimator is told."""
+        """Factor of the standard deviation of the bearings that is stated to the estimator."""
         return {"sigma half": 0.5, "sigma twice": 2.0}.get(self.model, 1.0)
 
 

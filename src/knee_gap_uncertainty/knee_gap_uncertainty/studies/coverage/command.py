@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def refuse(reason: str) -> int:
-    """Say in one line what the user must change."""
+    """Report in one line what the user must change."""
     print(f"coverage: {reason}", file=sys.stderr)
     return 2
 

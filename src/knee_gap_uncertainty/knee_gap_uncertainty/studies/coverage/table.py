@@ -18,7 +18,7 @@ SMALL_DEPTH_ERROR = 0.1
 
 @dataclass(frozen=True)
 class Row:
-    """One cell; lengths in millimetres, shares and chances from 0 to 1, NaN where there is nothing to tell.
+    """One cell; lengths in millimetres, shares and chances from 0 to 1, NaN if not known.
 
     `coverage` and what follows it to `bias_mm` are of the accepted runs. `missed_below`: the gap was below
     the interval. `width_mm` is a median, as are those of the ranges. `refused_lower_coverage`: how often the
@@ -76,7 +76,7 @@ def _plain(value: object) -> str:
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
-    """What the table says, in lines; cells outside of what is promised are counted and named."""
+    """A summary of the table, in lines; cells outside of what is promised are counted and named."""
     promised = [row for row in rows if row.promised]
     lines = [_coverage_line(f"{len(promised)} cells of the right model, >= 90 % accepted", promised)]
     outside = [row for row in promised if not PROMISED[0] <= row.coverage <= PROMISED[1]]

@@ -1,4 +1,4 @@
-"""`study`: the paper's tables and figures anew, as PNG, SVG, CSV and one HTML page."""
+"""`study`: the paper's tables and figures computed again, as PNG, SVG, CSV and one HTML page."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/study"), help="where to write (out/study)")
     parser.add_argument("--runs", type=int, default=1000, help="simulated runs of each scenario (1000)")
     parser.add_argument("--seed", type=int, default=SEED_OF_RUNS, help=f"seed of the runs ({SEED_OF_RUNS})")
-    parser.add_argument("--fit", action="store_true", help="search the geometry anew, and use what is found")
+    parser.add_argument("--fit", action="store_true", help="search the geometry again, and use what is found")
     options = parser.parse_args(argv)
     if not 2 <= options.runs <= MOST_RUNS:
         return refuse(f"--runs must be from 2 to {MOST_RUNS}, got {options.runs}")
@@ -56,13 +56,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def refuse(reason: str) -> int:
-    """Say in one line what the user must change."""
+    """Report in one line what the user must change."""
     print(f"study: {reason}", file=sys.stderr)
     return 2
 
 
 def searched() -> dict[str, Fit]:
-    """The best geometry of every reading, searched anew and printed beside what is stored."""
+    """The best geometry of every reading, searched again and printed beside what is stored."""
     fits = {}
     for reading in READINGS:
         steps = tqdm(search(reading), total=TRIES + REFINED, desc=reading.name, disable=quiet())

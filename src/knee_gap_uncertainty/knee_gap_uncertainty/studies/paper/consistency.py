@@ -48,7 +48,7 @@ def image_checks() -> list[Check]:
 
 
 def table_checks() -> list[Check]:
-    """What the text says of Table 4 against Table 4."""
+    """Statements of the text about Table 4, compared with Table 4."""
     first = [TABLE_4[number] for number in range(1, 5)]
     low, high = (float(np.mean([getattr(cell, name) for cell in first])) for name in ("minimum", "maximum"))
     widths = {SCENARIOS[i].angle_deg: cell.maximum - cell.minimum for i, cell in enumerate(first)}

@@ -1,4 +1,4 @@
-"""Which place of the gap gives Table 4: a seeded search, and how little the table tells of the place."""
+"""The place of the gap that gives Table 4: a seeded search, and how little the table determines it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

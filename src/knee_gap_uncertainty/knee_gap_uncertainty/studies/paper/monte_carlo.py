@@ -1,4 +1,4 @@
-"""Simulated runs of a scenario, errors random within their bounds: the mean and std of Table 4 anew."""
+"""Simulated runs of a scenario, errors random within their bounds: the mean and std of Table 4 again."""
 
 import math
 from dataclasses import dataclass

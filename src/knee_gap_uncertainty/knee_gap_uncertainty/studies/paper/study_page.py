@@ -13,7 +13,7 @@ TITLE = "How wide is the instrument gap? The paper's simulation study, done agai
 
 LEAD = """A gap of 4 mm inside the knee is seen twice by one lens that moves 2 or 8 mm between. How wide may
 it be? The paper answers with a cloud of possible places about each end of the gap. Here are its
-tables and figures, computed anew from its own parameters, beside a worst case that admits every
+tables and figures, computed again from its own parameters, beside a worst case that admits every
 sign its equations name."""
 
 CAPTIONS = {
@@ -39,7 +39,7 @@ CAPTIONS = {
     few millimetres more travel helps little and can harm.""",
     "sensitivity": """RMS difference to rows 1 to 5 of Table 4 as one number of the place changes and the
     others stay. The places in the table above are quite different and fit almost as well:
-    Table 4 does not tell where the gap was.""",
+    Table 4 does not show where the gap was.""",
 }
 
 

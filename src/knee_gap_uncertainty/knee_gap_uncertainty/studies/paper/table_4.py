@@ -1,4 +1,4 @@
-"""Table 4 anew: the paper's cells, ours by its own interval and by the worst case, and the differences."""
+"""Table 4 again: the paper's cells, ours by its own interval and by the worst case, and the differences."""
 
 import math
 from collections.abc import Iterator

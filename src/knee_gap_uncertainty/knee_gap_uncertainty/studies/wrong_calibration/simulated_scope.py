@@ -1,4 +1,4 @@
-"""A scope whose calibration is wrong by as much as is stated of it, and what the estimator says of it."""
+"""A scope whose calibration is wrong by as much as is stated of it, and the estimates that follow."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""Figure 9b, figure 12, Table 4 as a picture, the simulated runs, and how little the geometry is told."""
+"""Figure 9b, figure 12, Table 4 as a picture, the simulated runs, and how weakly it fixes the geometry."""
 
 import math
 from functools import partial
