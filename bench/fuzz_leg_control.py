@@ -18,7 +18,9 @@ import numpy as np
 
 from knee_gap_bringup.leg_control import Action, Command, Estimate, LegControl, LegParameters
 
-PARAMETERS = LegParameters(instrument_diameter=0.0055, largest_gap=0.006, opening_step=0.35, settling=0.1)
+PARAMETERS = LegParameters(
+    instrument_diameter=0.0055, largest_gap=0.006, opening_step=0.35, settling=0.1, narrowing_time=0.02
+)
 STEP = PARAMETERS.opening_step * PARAMETERS.opening_rate
 # What a step may take longer than planned: one look at the clock.
 LATE = 0.02 * PARAMETERS.opening_rate

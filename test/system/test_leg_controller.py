@@ -97,6 +97,7 @@ def leg(tmp_path: Path) -> Iterator[Leg]:
     with Processes(tmp_path, environment) as started:
         command = [executable("knee_gap_bringup", "leg_controller_node")]
         command += ["--ros-args", "-r", "__ns:=/knee_gap", "-p", "opening_step:=0.3", "-p", "settling:=0.2"]
+        command += ["-p", "narrowing_time:=0.0"]
         started.start("leg_controller_node", command)
         started.wait_ready(["leg_controller_node"], 60.0)
         with Client(DOMAIN) as client:

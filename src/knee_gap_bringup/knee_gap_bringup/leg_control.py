@@ -1,9 +1,10 @@
 """The ROS-free core of an example leg controller: it opens the joint until the instrument fits.
 
 A gap is measured while the joint is at rest. So the leg opens by a step, stops, comes to rest, and the gap is
-measured again by a track that began at rest. Every estimate is checked by the same rules, at rest and during
-a step; a rejected estimate stops the leg at once. Contradictory estimates hold the leg until a person resets
-it. `Estimate.from_message` reads messages of rclpy and of bags.
+measured again by a track that began at rest. The first interval of a track is its widest: the leg waits until
+it narrows no further before it opens again, and so opens less beyond what is needed. Every estimate is checked
+by the same rules, at rest and during a step; a rejected estimate stops the leg at once. Contradictory estimates
+hold the leg until a person resets it. `Estimate.from_message` reads messages of rclpy and of bags.
 """
 
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any, NamedTuple, Self
 
+from knee_gap_bringup.interval_watch import IntervalWatch
 from knee_gap_core.values.stamps import NANOSECONDS, stamp_ns
 
 # GapEstimate's constants, since the core does not import messages; a test compares them.
@@ -119,6 +121,18 @@ class LegParameters:
             "range": (0.05, 10.0),
         },
     )
+    narrowing_time: float = field(
+        default=0.5,
+        metadata={
+            "description": "time without a narrower interval after which the joint is opened [s]; while the "
+            "interval of a track narrows, the leg waits. 0: it does not wait",
+            "range": (0.0, 5.0),
+        },
+    )
+    longest_wait: float = field(
+        default=2.0,
+        metadata={"description": "longest time of such a wait in a track [s]", "range": (0.0, 60.0)},
+    )
     interval: str = field(
         default="worst_case",
         metadata={
@@ -212,6 +226,7 @@ class LegControl:
         self._heard: float | None = None
         self._publisher: str | None = None
         self._publishers: frozenset[str] = frozenset()
+        self._watch = IntervalWatch(parameters.narrowing_time, parameters.longest_wait)
 
     def on_estimate(self, estimate: Estimate, now: float) -> Command:
         """Command for an estimate received at `now`."""
@@ -238,6 +253,8 @@ class LegControl:
             return self._request_again(command, estimate, now)
         self._requests = 0
         if command.action is Action.OPEN:
+            if self._watch.narrows(estimate.track_id, estimate.gap_max - estimate.gap_min, now):
+                return hold("the interval still narrows")
             opening = min(self.parameters.opening_step, _time_to_limit(estimate, self.parameters))
             self._opens_until, self._step_track = now + opening, estimate.track_id
         return command

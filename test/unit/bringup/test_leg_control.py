@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import fuzz_leg_control
 import pytest
@@ -19,7 +20,13 @@ from knee_gap_bringup.leg_control import (
     decide,
 )
 
-PARAMETERS = LegParameters(instrument_diameter=0.004, largest_gap=0.012)
+
+def at_once(**settings: Any) -> LegParameters:
+    """Settings of a controller that opens at the first valid estimate of a track, without waiting."""
+    return LegParameters(narrowing_time=0.0, **settings)
+
+
+PARAMETERS = at_once(instrument_diameter=0.004, largest_gap=0.012)
 NARROW = Estimate(is_valid=True, track_id=1, age=0.05, gap=0.005, gap_min=0.0039, gap_max=0.006)
 WIDE = NARROW._replace(gap_min=0.0045)
 LOST = NARROW._replace(is_valid=False, track_id=0, gap=math.nan, gap_min=math.nan, gap_max=math.nan)
@@ -76,7 +83,7 @@ def test_holds_on_what_the_rules_refuse(estimate) -> None:
 
 @pytest.mark.parametrize("estimate", [*FAULTY.values(), *REFUSED.values()], ids=[*FAULTY, *REFUSED])
 def test_inside_a_step_the_same_rules_stop_it_at_once(estimate) -> None:
-    control = at_rest(LegParameters(opening_step=5.0, settling=0.3))
+    control = at_rest(at_once(opening_step=5.0, settling=0.3))
     first, bad, good = images(NARROW, estimate, NARROW)
     assert control.on_estimate(first, 10.0).opening_rate > 0.0
     assert control.on_estimate(bad, 10.1).opening_rate == 0.0
@@ -85,7 +92,7 @@ def test_inside_a_step_the_same_rules_stop_it_at_once(estimate) -> None:
 
 @pytest.mark.parametrize("estimate", FAULTY.values(), ids=FAULTY)
 def test_what_contradicts_itself_holds_the_leg_until_a_person_resets_it(estimate) -> None:
-    control = at_rest(LegParameters(settling=0.3))
+    control = at_rest(at_once(settling=0.3))
     bad, *good = images(estimate, *[NARROW._replace(track_id=9)] * 4)
     control.on_estimate(bad, 10.0)
     assert control.fault
@@ -203,7 +210,7 @@ def test_settings_that_contradict_each_other_are_refused(settings, words) -> Non
 
 
 def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
-    control = at_rest(LegParameters(opening_step=0.5, settling=0.3, deadline=1.0), now=0.0)
+    control = at_rest(at_once(opening_step=0.5, settling=0.3, deadline=1.0), now=0.0)
     first, moving, over, during, resting_leg, later, late, again, open_again = images(
         NARROW,
         NARROW,
@@ -225,15 +232,59 @@ def test_opens_by_a_step_and_acts_only_on_a_track_begun_at_rest() -> None:
     assert control.on_estimate(open_again, 2.1).action is Action.OPEN
 
 
+WAITING = LegParameters(opening_step=0.5, settling=0.3, deadline=1.0, narrowing_time=0.3, longest_wait=1.0)
+
+
+def actions(control: LegControl, widths: list[float], begin: float = 0.0) -> list[str]:
+    """What is commanded for intervals of these widths [mm], a tenth of a second apart, at one lower bound."""
+    estimates = images(*[NARROW._replace(gap_max=0.0039 + 1e-3 * width, gap=0.0039) for width in widths])
+    return [str(control.on_estimate(one, begin + 0.1 * k).action) for k, one in enumerate(estimates)]
+
+
+def test_while_the_interval_narrows_the_leg_waits_and_then_opens() -> None:
+    # Narrower by a tenth each time, then by too little to count.
+    found = actions(at_rest(WAITING, now=0.0), [5.0, 4.5, 4.0, 3.9, 3.9, 3.85, 3.85])
+    assert found == ["hold"] * 5 + ["open"] * 2
+
+
+def test_it_waits_no_longer_than_allowed() -> None:
+    widths = [5.0 * 0.9**k for k in range(12)]
+    assert actions(at_rest(WAITING, now=0.0), widths) == ["hold"] * 10 + ["open"] * 2
+
+
+def test_what_fits_meanwhile_passes_at_once_and_what_is_refused_holds() -> None:
+    control = at_rest(WAITING, now=0.0)
+    waits, lost, fits = images(NARROW, LOST, WIDE)
+    assert control.on_estimate(waits, 0.0).reason == "the interval still narrows"
+    assert control.on_estimate(lost, 0.1).reason == "the gap is not known"
+    assert control.on_estimate(fits, 0.2).action is Action.PASS
+
+
+def test_each_track_is_waited_for_anew_and_an_old_one_is_not_opened_for() -> None:
+    control = at_rest(WAITING, now=0.0)
+    first, other, same = images(NARROW, NARROW._replace(track_id=2), NARROW._replace(track_id=2))
+    assert control.on_estimate(first, 0.0).action is Action.HOLD
+    assert control.on_estimate(other, 0.29).action is Action.HOLD
+    assert control.on_estimate(same, 0.58).action is Action.HOLD
+    later = same._replace(stamp_ns=9)
+    assert control.on_estimate(later, 0.6).action is Action.OPEN
+
+
+def test_inside_a_step_it_does_not_wait() -> None:
+    control = at_rest(WAITING, now=0.0)
+    found = actions(control, [5.0, 5.0, 5.0, 5.0, 3.0, 2.0])
+    assert found == ["hold"] * 3 + ["open"] * 3
+
+
 def test_while_the_joint_moves_not_even_that_the_instrument_fits_counts() -> None:
-    control = at_rest(LegParameters(opening_step=0.5, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=0.5, settling=0.3), now=0.0)
     first, fits = images(NARROW, WIDE)
     assert control.on_estimate(first, 0.0).action is Action.OPEN
     assert control.on_estimate(fits, 0.1).action is Action.HOLD
 
 
 def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_came_after() -> None:
-    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=0.1, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
     assert control.on_time(0.1).action is Action.HOLD
     assert control.on_time(0.45).measure_again
@@ -244,14 +295,14 @@ def test_a_track_whose_first_image_is_of_the_motion_is_not_acted_on_though_it_ca
 
 
 def test_time_alone_ends_a_step() -> None:
-    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=0.1, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW, 0.0).action is Action.OPEN
     assert control.on_time(0.09) is None
     assert control.on_time(0.1).opening_rate == 0.0
 
 
 def test_a_step_is_shorter_where_the_limit_is_nearer() -> None:
-    control = at_rest(LegParameters(opening_step=5.0, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=5.0, settling=0.3), now=0.0)
     assert control.on_estimate(NARROW._replace(gap_max=0.0119), 0.0).action is Action.OPEN
     assert control.on_time(0.099) is None
     assert control.on_time(0.101).opening_rate == 0.0
@@ -263,7 +314,7 @@ def test_a_leg_that_does_not_move_needs_no_time_to_its_limit() -> None:
 
 
 def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
-    control = at_rest(LegParameters(opening_step=5.0, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=5.0, settling=0.3), now=0.0)
     first, *after = images(*[NARROW] * 4)
     assert control.on_estimate(first, 0.0).opening_rate > 0.0
     assert control.on_time(0.19) is None
@@ -274,7 +325,7 @@ def test_silence_ends_a_step_and_what_comes_after_is_measured_anew() -> None:
 
 
 def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
-    control = at_rest(LegParameters(opening_step=0.1, settling=0.3), now=0.0)
+    control = at_rest(at_once(opening_step=0.1, settling=0.3), now=0.0)
     first, over, silent, old = images(NARROW, NARROW, LOST, NARROW)
     assert control.on_estimate(first, 0.0).opening_rate > 0.0
     assert control.on_estimate(over, 0.1).action is Action.HOLD
@@ -283,12 +334,12 @@ def test_a_rest_that_ends_in_silence_does_not_make_an_old_track_new() -> None:
 
 
 def test_a_controller_that_starts_acts_on_no_track_that_may_have_begun_before() -> None:
-    control = LegControl(LegParameters(settling=0.3), 10.0)
+    control = LegControl(at_once(settling=0.3), 10.0)
     running = images(*[WIDE] * 40)
     # It starts, and receives the track at once, or only after it has come to rest: both are of before.
     assert control.on_estimate(running[0], 10.1).action is Action.HOLD
     assert control.on_estimate(running[1], 10.35).measure_again
-    late = LegControl(LegParameters(settling=0.3), 10.0)
+    late = LegControl(at_once(settling=0.3), 10.0)
     assert late.on_time(10.35).measure_again
     for k in range(30):
         assert late.on_estimate(running[2 + k], 11.0 + 0.016 * k).action is Action.HOLD
