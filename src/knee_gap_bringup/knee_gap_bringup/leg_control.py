@@ -2,9 +2,9 @@
 
 A gap is measured while the joint is at rest. So the leg opens by a step, stops, comes to rest, and the gap is
 measured again by a track that began at rest. The first interval of a track is its widest: the leg waits until
-it narrows no further before it opens again, and so opens less beyond what is needed. Every estimate is checked
-by the same rules, at rest and during a step; a rejected estimate stops the leg at once. Contradictory estimates
-hold the leg until a person resets it. `Estimate.from_message` reads messages of rclpy and of bags.
+it narrows no further before it opens again, and so opens less beyond what is needed. Every estimate is
+checked by the same rules, at rest and during a step; a rejected estimate stops the leg at once. Contradictory
+estimates hold the leg until a person resets it. `Estimate.from_message` reads messages of rclpy and of bags.
 """
 
 from dataclasses import dataclass, field
