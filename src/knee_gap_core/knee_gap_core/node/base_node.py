@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from threadpoolctl import threadpool_limits
 
 from knee_gap_core.node.errors import ConfigurationError
@@ -16,7 +17,14 @@ from knee_gap_core.node.parameters import as_rows, declare, refuse_unknown, refu
 from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.node.wiring import Health
 
+try:
+    from rclpy.experimental import EventsExecutor
+except ImportError:
+    EventsExecutor = None
+
 Parameters = TypeVar("Parameters")
+
+LONGEST_SPIN = 3600.0  # [s] without a look whether ROS is shut down
 
 # Images: whatever the camera offers, and never a growing queue of old ones. Eight hold 133 ms at 60 Hz, which
 # a two-core machine needs to lose nothing when another process takes its turn.
@@ -174,6 +182,23 @@ def _is_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
+def new_executor() -> Any:
+    """An executor that the middleware calls, where rclpy has it (from 7.1.4 on).
+
+    The other one builds a set of all that it waits for at every message, in Python, which costs more than
+    what is done with a pose.
+    """
+    return SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
+
+
+def spin(executor: Any) -> None:
+    """Spin until ROS is shut down."""
+    never = Future()
+    while rclpy.ok():
+        # Not its `spin`: built for an old C library, it looks at the clock without a pause.
+        executor.spin_until_future_complete(never, timeout_sec=LONGEST_SPIN)
+
+
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     """Start a node, spin until it is stopped, return the exit code: 2 for a mistake of the user's."""
     try:
@@ -184,14 +209,14 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         return 2
     # The matrices here are small: threads of the linear algebra would spin for a second core and win nothing.
     threadpool_limits(1)
-    node = None
+    node = executor = None
     try:
         node = make_node()
         # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
-        executor = SingleThreadedExecutor()
+        executor = new_executor()
         executor.add_node(node)
         node.get_logger().info("ready")
-        executor.spin()
+        spin(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ConfigurationError as error:
@@ -203,6 +228,9 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         if rclpy.ok() and not _is_interrupted(error):
             raise
     finally:
+        if executor is not None:
+            # Before what the middleware would call is gone.
+            executor.shutdown()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
