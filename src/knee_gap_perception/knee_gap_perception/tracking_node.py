@@ -11,6 +11,7 @@ from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_core.node.wiring import Health
+from knee_gap_core.values import quaternions
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters
 from knee_gap_perception.scope_pose.tracking_core import NODE, TRANSFORMS, TrackingCore
@@ -41,6 +42,7 @@ class TrackingNode(WiredNode):
             raise ConfigurationError(str(error)) from error
         self.open_outputs(self.core.outputs)
         self.publish(self.core.begin(self.now_ns()))
+        quaternions.warm_up()
         # Images and Motive's frames arrive in threads of their own.
         self._one_at_a_time = threading.Lock()
         for given in self.core.inputs:

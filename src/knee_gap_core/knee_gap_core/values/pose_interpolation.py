@@ -8,17 +8,31 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.pose_continuity import PoseContinuity
 from knee_gap_core.values.poses import BodyPose, LensPose
+from knee_gap_core.values.quaternions import (
+    between,
+    from_rotation_vector,
+    product,
+    turn_from,
+    unit_quaternion,
+)
 
 POSES = 3  # through which the motion is drawn
 KEPT = 512  # poses: half a second of the fastest tracker, longer than an image is on its way
 LONGEST_STEP_NS = 40_000_000  # between poses that describe one motion, and beyond the last
 ACCELERATION = 0.5  # [m/s^2] of a hand, RMS
 ANGULAR_ACCELERATION = 2.0  # [rad/s^2]
+
+
+def _per_axis(acceleration: float, angular_acceleration: float) -> Array:
+    """(6,) of each axis, as in a covariance."""
+    return np.array([acceleration] * 3 + [angular_acceleration] * 3)
+
+
+ACCELERATIONS = _per_axis(ACCELERATION, ANGULAR_ACCELERATION)
 
 
 Pose = BodyPose | LensPose
@@ -29,10 +43,8 @@ def place_between(before: Pose, after: Pose, share: float) -> tuple[Array, Array
 
     Positions linearly, rotations by slerp.
     """
-    start, end = Rotation.from_quat(before.quaternion_xyzw), Rotation.from_quat(after.quaternion_xyzw)
-    turn = (end * start.inv()).as_rotvec()
     position: Array = (1.0 - share) * before.position + share * after.position
-    return position, np.asarray((Rotation.from_rotvec(share * turn) * start).as_quat(canonical=True))
+    return position, between(before.quaternion_xyzw, after.quaternion_xyzw, share)
 
 
 def body_between(before: BodyPose, after: BodyPose, stamp_ns: int) -> BodyPose:
@@ -60,7 +72,7 @@ def lens_between(
     covariance: Array = (1.0 - share) * before.covariance + share * after.covariance
     # A constant acceleration a bends the path by a s u / 2, s after one and u before the other pose.
     bend = since * until / 2.0
-    accelerations = np.repeat([acceleration, angular_acceleration], 3)
+    accelerations = _per_axis(acceleration, angular_acceleration)
     return replace(
         after,
         stamp_ns=stamp_ns,
@@ -126,21 +138,20 @@ class LensPosePredictor:
         # Value at time 0 of the line through the poses, as weights of the poses.
         centred = times - times.mean()
         weights = 1.0 / len(near) - times.mean() * centred / (centred @ centred)
-        reference = Rotation.from_quat(near[-1].quaternion_xyzw)
-        turns = np.stack(
-            [(Rotation.from_quat(p.quaternion_xyzw) * reference.inv()).as_rotvec() for p in near]
-        )
+        reference = near[-1].quaternion_xyzw
+        turns = np.stack([turn_from(reference, pose.quaternion_xyzw) for pose in near])
         # A constant acceleration a adds a t^2 / 2 to each pose.
         bend = abs(float(weights @ times**2)) / 2.0
-        curved = np.repeat([ACCELERATION, ANGULAR_ACCELERATION], 3) * bend
-        noise: Array = np.einsum("k,kij->ij", weights**2, np.stack([pose.covariance for pose in near]))
+        noise = np.zeros((6, 6))
+        for weight, pose in zip(weights, near, strict=True):
+            noise += weight**2 * pose.covariance
         return LensPose(
             stamp_ns=stamp_ns,
             frame_id=near[-1].frame_id,
             child_frame_id=near[-1].child_frame_id,
             position=weights @ np.stack([pose.position for pose in near]),
-            quaternion_xyzw=(Rotation.from_rotvec(weights @ turns) * reference).as_quat(),
-            covariance=noise + np.diag(curved**2 / 3.0),
+            quaternion_xyzw=product(from_rotation_vector(weights @ turns), unit_quaternion(reference)),
+            covariance=noise + np.diag((ACCELERATIONS * bend) ** 2 / 3.0),
         )
 
     def _motion(self, stamp_ns: int) -> list[LensPose]:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
+from knee_gap_core.values.quaternions import matrix, unit_quaternion
 
 # No tracker sees farther [m]; what lies beyond is no place, and its square may be no number.
 FARTHEST = 1000.0
@@ -76,7 +76,7 @@ class FramePose(NamedTuple):
 def rigid_transform(position: npt.ArrayLike, quaternion_xyzw: npt.ArrayLike) -> Array:
     """4x4 matrix of a position (3,) and a quaternion (4,), which is brought to unit length."""
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    T[:3, :3] = matrix(unit_quaternion(np.array(quaternion_xyzw, dtype=np.float64)))
     T[:3, 3] = position
     return T
 

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from knee_gap_core.values import quaternions
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
@@ -28,6 +29,7 @@ def picture(shift: int) -> npt.NDArray[np.uint8]:
 
 def warm_up() -> EdgeStatus:
     """Detect a gap and track its edges in a few images; return the last status, VALID if all code was run."""
+    quaternions.warm_up()
     camera = FisheyeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, (0.0, 0.0, 0.0, 0.0))
     detector = GapEdgeTracker()
     status = EdgeStatus.UNKNOWN

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.poses import BodyPose, LensPose, rigid_transform
-from knee_gap_core.values.rigid_transforms import skew
+from knee_gap_core.values.quaternions import canonical, matrix, product, unit_quaternion
+from knee_gap_core.values.rigid_transforms import quaternion_xyzw, skew
 from knee_gap_perception.calibration.calibration import Calibration
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.parameters import check_parameters
@@ -170,6 +171,8 @@ class ScopeTracker:
         self.latest: Tracked | None = None
         T_body_lens = calibration.body_to_lens() if calibration else self.parameters.body_to_lens()
         self._T_body_lens = T_body_lens
+        self._q_body_lens = quaternion_xyzw(T_body_lens)
+        self._body_covariance = self._covariance_of_body()
         # An image's stamp plus this is the tracker's clock.
         clock = calibration.clock if calibration else None
         self._clock_offset_ns = round(clock.offset * 1e9) if clock else 0
@@ -287,15 +290,19 @@ class ScopeTracker:
     def _lens_pose(self, tracked: Tracked, turn: float, turn_error: float) -> LensPose:
         """Pose of the lens at a turn [rad] of the scope, with its standard error."""
         parameters, body = self.parameters, tracked.body
-        R_world_body = Rotation.from_quat(body.quaternion_xyzw)
-        T_body_lens = self.body_to_lens(turn)
-        lever = R_world_body.apply(T_body_lens[:3, 3])
-        quaternion = (R_world_body * Rotation.from_matrix(T_body_lens[:3, :3])).as_quat(canonical=True)
-        covariance = self._covariance(lever) + self._axis_covariance(turn)
+        q_world_body = unit_quaternion(body.quaternion_xyzw)
+        T_body_lens, q_body_lens = self._T_body_lens, self._q_body_lens
+        if turn:
+            T_body_lens = self.body_to_lens(turn)
+            q_body_lens = quaternion_xyzw(T_body_lens)
+        R_world_body = matrix(q_world_body)
+        lever = R_world_body @ T_body_lens[:3, 3].copy()
+        quaternion = canonical(product(q_world_body, q_body_lens))
+        covariance = self._covariance(lever)
+        if turn:
+            covariance = covariance + self._axis_covariance(turn)
         if turn_error and self.calibration is not None:
-            moved = np.kron(np.eye(2), R_world_body.as_matrix()) @ self.calibration.motion_by_rotation(
-                T_body_lens
-            )
+            moved = np.kron(np.eye(2), R_world_body) @ self.calibration.motion_by_rotation(T_body_lens)
             covariance = covariance + turn_error**2 * np.outer(moved, moved)
         lens = LensPose(
             stamp_ns=tracked.stamp_ns,
@@ -308,11 +315,11 @@ class ScopeTracker:
         )
         if tracked.reference is None:
             return lens
-        return relative_to(lens, tracked.reference, self._body_covariance())
+        return relative_to(lens, tracked.reference, self._body_covariance)
 
     def _covariance(self, lever: Array) -> Array:
         """Covariance (6, 6) of the lens pose; a small rotation r moves the lens by r x lever."""
-        covariance = self._body_covariance()
+        covariance = self._body_covariance
         if self.parameters.translation_error_at == "lens":
             return covariance
         J = np.eye(6)
@@ -322,14 +329,14 @@ class ScopeTracker:
     def _axis_covariance(self, turn: float) -> Array:
         """What the error of the shaft's axis adds at a turn: nothing at the calibrated one."""
         oblique = self.calibration.oblique if self.calibration else None
-        if oblique is None or oblique.axis is None or not turn:
+        if oblique is None or oblique.axis is None:
             return np.zeros((6, 6))
         chord = 2.0 * np.sin(0.5 * turn)
         return np.diag(
             np.repeat([(chord * oblique.axis_shift_sigma) ** 2, (chord * oblique.axis_tilt_sigma) ** 2], 3)
         )
 
-    def _body_covariance(self) -> Array:
+    def _covariance_of_body(self) -> Array:
         translation, rotation = self.parameters.translation_error, self.parameters.rotation_error
         return np.diag(np.repeat([translation**2 / 3.0, rotation**2 / 3.0], 3))
 

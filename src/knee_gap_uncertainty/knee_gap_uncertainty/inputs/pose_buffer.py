@@ -7,13 +7,13 @@ from enum import StrEnum
 from math import isfinite
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_core.values.pose_continuity import PoseContinuity
 from knee_gap_core.values.pose_interpolation import lens_between
 from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.quaternions import turn_from
 
 # Over which the velocity is taken [ns]. The tracker's noise on it falls with this time, but the older it is,
 # the more a hand's has changed: 0.0367 mm over 17 ms are 3 mm/s, as are 0.5 m/s^2 in 6 ms.
@@ -170,8 +170,8 @@ def _motion(one: LensPose, other: LensPose) -> Array:
     """Velocity and turning (6,) between two poses; NaN between a pose and itself."""
     if one is other:
         return np.full(6, np.nan)
-    turn = Rotation.from_quat(other.quaternion_xyzw) * Rotation.from_quat(one.quaternion_xyzw).inv()
-    moved = np.concatenate([other.position - one.position, turn.as_rotvec()])
+    turn = turn_from(one.quaternion_xyzw, other.quaternion_xyzw)
+    moved = np.concatenate([other.position - one.position, turn])
     return np.asarray(moved / ((other.stamp_ns - one.stamp_ns) / 1e9))
 
 

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.poses import LensPose
+from knee_gap_core.values.quaternions import matrix, unit_quaternion
 from knee_gap_uncertainty.multi_view.views import Views
 
 Floats = npt.NDArray[np.float64]
@@ -34,9 +34,8 @@ def posed_view(edges: GapEdges, pose: LensPose, tracker_bound: float, camera_err
     `camera_error` [-] is the relative standard error of a focal length that was not calibrated; it comes to
     the errors of the camera that the edges state. Raises BadInputError for matrices that are not covariances.
     """
-    rotation = Rotation.from_quat(pose.quaternion_xyzw)
-    matrix = rotation.as_matrix()
-    bearings = edges.bearings @ matrix.T
+    rotation = matrix(unit_quaternion(pose.quaternion_xyzw))
+    bearings = edges.bearings @ rotation.T
     translation, turn = pose.covariance[:3, :3], pose.covariance[3:, 3:]
     return PosedView(
         stamp_ns=edges.stamp_ns,
@@ -47,14 +46,14 @@ def posed_view(edges: GapEdges, pose: LensPose, tracker_bound: float, camera_err
         view=Views(
             lens_positions=pose.position[None],
             bearings=bearings[None],
-            bearing_covariances=(matrix @ edges.covariances @ matrix.T)[None],
+            bearing_covariances=(rotation @ edges.covariances @ rotation.T)[None],
             lens_covariances=translation[None],
             rotation_covariances=turn[None],
-            lens_rotations=matrix[None],
+            lens_rotations=rotation[None],
             lens_motions=np.nan_to_num(pose.motion)[None],
             motion_times=np.array([pose.motion_time]),
             scope_rotations=np.array([pose.scope_rotation]),
-            camera_errors=(matrix @ _camera_errors(edges, camera_error))[None],
+            camera_errors=(rotation @ _camera_errors(edges, camera_error))[None],
             times=np.array([1e-9 * edges.stamp_ns]),
         ),
     )
