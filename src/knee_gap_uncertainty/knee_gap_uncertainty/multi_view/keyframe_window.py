@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.views import Views, joined
 
@@ -28,6 +29,8 @@ class ViewWindow:
             raise BadInputError(f"a window must hold at least 2 views, not {capacity}")
         self._capacity = capacity
         self._views: list[Views] = []
+        # All of them in one, because a live track asks for them at every image; None while there is none.
+        self._all: Views | None = None
         self._spacing = SPACING
         self._moved_on = False
 
@@ -43,11 +46,13 @@ class ViewWindow:
         if len(view) != 1:
             raise BadInputError(f"one view is added at a time, not {len(view)}")
         keep = self._moved_on or not self._views
-        self._moved_on = not keep and self._is_apart(view, self._views)
+        self._moved_on = not keep and self._is_apart(view, self._positions())
         if keep:
             self._views.append(view)
+            self._all = view if self._all is None else self._all.joined(view)
             while len(self._views) > self._capacity:
                 self._thin()
+                self._all = joined(self._views, view.common_share)
         return keep
 
     def views(self, common_share: float) -> Views:
@@ -55,13 +60,17 @@ class ViewWindow:
 
         Raises BadInputError while there is none.
         """
-        if not self._views:
+        if self._all is None:
             raise BadInputError("the window is empty: add a view first")
-        return joined(self._views, common_share)
+        return joined([self._all], common_share)
 
-    def _is_apart(self, view: Views, others: list[Views]) -> bool:
-        """Whether the lens is more than the spacing away from all of the others."""
-        positions = np.concatenate([other.lens_positions for other in others])
+    def _positions(self) -> Array:
+        """Lens positions (N, 3) [m] of the views kept, at least one."""
+        assert self._all is not None
+        return self._all.lens_positions
+
+    def _is_apart(self, view: Views, positions: Array) -> bool:
+        """Whether the lens is more than the spacing away from all of the positions (n, 3) [m]."""
         nearest = float(np.linalg.norm(positions - view.lens_positions, axis=1).min())
         return nearest > self._spacing * float(np.sqrt(np.trace(view.lens_covariances[0])))
 
@@ -70,7 +79,8 @@ class ViewWindow:
         self._spacing *= COARSER
         kept: list[Views] = []
         for view in self._views:
-            if not kept or view is self._views[-1] or self._is_apart(view, kept):
+            places = [other.lens_positions for other in kept]
+            if not kept or view is self._views[-1] or self._is_apart(view, np.concatenate(places)):
                 kept.append(view)
         # Views of errors so small that no spacing thins them.
         self._views = kept if len(kept) < len(self._views) else [kept[0], *kept[2:]]

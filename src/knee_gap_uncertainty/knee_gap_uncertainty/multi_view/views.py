@@ -1,10 +1,11 @@
 """The views of a track: lens positions and bearings in one frame, with their errors."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
+from knee_gap_core.compiled import compiled
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.errors import BadInputError
 from knee_gap_uncertainty.multi_view.likelihood import complete_frame
@@ -60,22 +61,14 @@ class Views:
             "rotation_covariances",
         ):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
-        count = len(self.lens_positions) if self.lens_positions.ndim else 0
-        _check_shape("lens_positions", self.lens_positions, (count, 3))
-        _check_shape("bearings", self.bearings, (count, 2, 3))
-        _check_shape("bearing_covariances", self.bearing_covariances, (count, 2, 3, 3))
-        _check_shape("lens_covariances", self.lens_covariances, (count, 3, 3))
-        _check_shape("rotation_covariances", self.rotation_covariances, (count, 3, 3))
         if not 0.0 <= self.common_share <= 1.0:
             raise BadInputError(f"common_share must lie in [0, 1], not {self.common_share!r}")
+        count = len(self.lens_positions) if self.lens_positions.ndim else 0
+        if not self._are_arrays_sound(count):
+            self._check_arrays(count)
         if count == 0:
             return
         lengths = np.linalg.norm(self.bearings, axis=-1)
-        worst = np.unravel_index(np.argmax(np.abs(lengths - 1.0)), lengths.shape)
-        if abs(lengths[worst] - 1.0) > LONGEST_UNIT_VECTOR_DEVIATION:
-            raise BadInputError(
-                f"bearing {worst[1]} of view {worst[0]} must have length 1, not {lengths[worst]:.6g}"
-            )
         object.__setattr__(self, "bearings", self.bearings / lengths[..., None])
         if self.lens_rotations is not None:
             object.__setattr__(
@@ -90,6 +83,33 @@ class Views:
             raise BadInputError(f"motion_times must be {count} times above 0 s, not {self.motion_times}")
         if self.camera_errors is not None:
             _check_shape("camera_errors", self.camera_errors, (count, 2, 3, self.camera_errors.shape[-1]))
+
+    def _are_arrays_sound(self, count: int) -> bool:
+        """Whether the five arrays that are always there keep the rules: quick, without a reason."""
+        return (
+            self.lens_positions.shape == (count, 3)
+            and self.bearings.shape == (count, 2, 3)
+            and self.bearing_covariances.shape == (count, 2, 3, 3)
+            and self.lens_covariances.shape == self.rotation_covariances.shape == (count, 3, 3)
+            and _are_bearings_sound(self.lens_positions, self.bearings, self.bearing_covariances)
+            and _are_covariances(self.bearing_covariances.reshape(-1, 3, 3))
+            and _are_covariances(self.lens_covariances)
+            and _are_covariances(self.rotation_covariances)
+        )
+
+    def _check_arrays(self, count: int) -> None:
+        """Raise BadInputError for the first of the five arrays that breaks a rule."""
+        _check_shape("lens_positions", self.lens_positions, (count, 3))
+        _check_shape("bearings", self.bearings, (count, 2, 3))
+        _check_shape("bearing_covariances", self.bearing_covariances, (count, 2, 3, 3))
+        _check_shape("lens_covariances", self.lens_covariances, (count, 3, 3))
+        _check_shape("rotation_covariances", self.rotation_covariances, (count, 3, 3))
+        lengths = np.linalg.norm(self.bearings, axis=-1)
+        worst = np.unravel_index(np.argmax(np.abs(lengths - 1.0)), lengths.shape)
+        if abs(lengths[worst] - 1.0) > LONGEST_UNIT_VECTOR_DEVIATION:
+            raise BadInputError(
+                f"bearing {worst[1]} of view {worst[0]} must have length 1, not {lengths[worst]:.6g}"
+            )
         _check_covariance("bearing_covariances", self.bearing_covariances)
         _check_covariance("lens_covariances", self.lens_covariances)
         _check_covariance("rotation_covariances", self.rotation_covariances)
@@ -101,6 +121,12 @@ class Views:
                 f"the standard deviation of a bearing must be at most {LARGEST_BEARING_DEVIATION} rad, "
                 f"not {deviations.max():.3g}"
             )
+
+    def with_arrays(self, changed: Mapping[str, Array]) -> "Views":
+        """These views with other arrays of the same shapes in some fields, known to keep the rules."""
+        views = object.__new__(Views)
+        views.__dict__.update(self.__dict__, **changed)
+        return views
 
     def joined(self, other: "Views") -> "Views":
         """These views and then `other`'s, with the common share of these."""
@@ -146,7 +172,10 @@ def joined(parts: Sequence[Views], common_share: float) -> Views:
             continue
         values = [getattr(part, field.name) for part in parts]
         known = [value for value in values if value is not None]
-        arrays[field.name] = np.concatenate(known) if len(known) == len(parts) and _alike(known) else None
+        if len(known) < len(parts) or not _alike(known):
+            arrays[field.name] = None
+        else:
+            arrays[field.name] = np.concatenate(known) if len(known) > 1 else known[0]
     return _checked_before(arrays, common_share)
 
 
@@ -205,6 +234,48 @@ def _check_covariance(name: str, value: Array) -> None:
     )
     if min(float(minor.min()) for minor in minors) < -ROUNDING:
         raise BadInputError(f"{name} must be positive semi-definite: a variance below 0 was found")
+
+
+@compiled
+def _are_bearings_sound(lens: Array, bearings: Array, covariances: Array) -> bool:
+    """Whether positions are finite, bearings of unit length, and their deviations in range."""
+    for i in range(lens.shape[0]):
+        if not np.isfinite(lens[i, 0] + lens[i, 1] + lens[i, 2]):
+            return False
+        for n in range(2):
+            length = np.sqrt(bearings[i, n, 0] ** 2 + bearings[i, n, 1] ** 2 + bearings[i, n, 2] ** 2)
+            variance = (covariances[i, n, 0, 0] + covariances[i, n, 1, 1] + covariances[i, n, 2, 2]) / 2.0
+            if not (abs(length - 1.0) <= LONGEST_UNIT_VECTOR_DEVIATION and variance > 0.0):
+                return False
+            if not np.sqrt(variance) <= LARGEST_BEARING_DEVIATION:
+                return False
+    return True
+
+
+@compiled
+def _are_covariances(matrices: Array) -> bool:
+    """Whether matrices (N, 3, 3) are finite, symmetric and positive semi-definite, as `_check_covariance`."""
+    scale = 1e-300
+    for value in matrices.flat:
+        if not np.isfinite(value):
+            return False
+        scale = max(scale, float(abs(value)))
+    for i in range(matrices.shape[0]):
+        m = matrices[i] / scale
+        for k in range(3):
+            ahead = (k + 1) % 3
+            if not abs(m[k, ahead] - m[ahead, k]) <= ROUNDING:
+                return False
+            if not min(m[k, k], m[k, k] * m[ahead, ahead] - m[k, ahead] ** 2) >= -ROUNDING:
+                return False
+        determinant = (
+            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] ** 2)
+            - m[0, 1] * (m[0, 1] * m[2, 2] - m[1, 2] * m[0, 2])
+            + m[0, 2] * (m[0, 1] * m[1, 2] - m[1, 1] * m[0, 2])
+        )
+        if not determinant >= -ROUNDING:
+            return False
+    return True
 
 
 def bearing_covariances(bearings: Array, deviation: float | Array) -> Array:

@@ -14,6 +14,7 @@ What nobody calibrated has the errors that the parameters state: an uncalibrated
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
 from knee_gap_uncertainty.multi_view.scale_drift import widened
 from knee_gap_uncertainty.multi_view.views import Views
 from knee_gap_uncertainty.scope_calibration.posed_view import PosedView
+from knee_gap_uncertainty.scope_calibration.shared_error_kernel import moved_points, shared_views
 
 HASH_DIGITS = 12  # of a hash, in words
 
@@ -160,10 +162,15 @@ class CalibrationError:
         They are shift, rotation and clock, and then those of camera, drift and scale, of a variance of 1.
         """
         root = np.eye(count)
-        values, vectors = np.linalg.eigh(self.covariance)
-        root[:6, :6] = vectors * np.sqrt(np.maximum(values, 0.0))
+        root[:6, :6] = self._lens_root
         root[6, 6] = self.clock
         return root
+
+    @cached_property
+    def _lens_root(self) -> Array:
+        """(6, 6) root of `covariance`."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     def _moved_points(self, fit: MultiViewFit, views: Views) -> Array:
         """(6, 7 + k + 7): how far the points go with shift, rotation, clock, camera, drift and scale.
@@ -171,44 +178,10 @@ class CalibrationError:
         By weighted least squares on the bearings, as the fit. Positions are counted from the last view's:
         what moves all lenses alike moves the points with them, and their distance not at all.
         """
-        rotations = views.calibrated_rotations
-        motions = _motions(views)
-        by_camera = _camera_errors(views)
-        camera = slice(7, 7 + by_camera.shape[-1])
-        count = camera.stop + 7
-        moved = np.zeros((6, count))
-        lens_moved = np.zeros((len(views), 3, count))
-        lens_moved[:, :, :3] = rotations - rotations[-1]
-        lens_moved[:, :, 6] = motions[:, :3] - motions[-1, :3]
-        turned = np.zeros((len(views), 3, count))
-        turned[:, :, 3:6] = rotations
-        turned[:, :, 6] = motions[:, 3:]
-        crept = rotations * _seconds(views)[:, None, None] / np.sqrt(3.0)
-        lens_moved[:, :, camera.stop : camera.stop + 3] = self.drift * (crept - crept[-1])
-        turned[:, :, camera.stop + 3 : camera.stop + 6] = self.angular_drift * crept
-        lens_moved[:, :, camera.stop + 6] = self.scale * (views.lens_positions - views.lens_positions[-1])
-        lens_variance = np.trace(views.lens_covariances, axis1=1, axis2=2) / 3.0
-        rotation_variance = np.trace(views.rotation_covariances, axis1=1, axis2=2) / 3.0
-        for n in range(2):
-            used = fit.used[:, n]
-            ray = fit.points[n] - views.lens_positions[used]
-            length = np.linalg.norm(ray, axis=1)
-            bearing = ray / length[:, None]
-            across = np.eye(3) - bearing[:, :, None] * bearing[:, None, :]
-            image_variance = np.trace(views.bearing_covariances[used, n], axis1=1, axis2=2) / 2.0
-            variance = image_variance + rotation_variance[used] + lens_variance[used] / length**2
-            weight = 1.0 / (variance * length**2)
-            # A lens that moves takes its ray along; a bearing b that turns by r goes by r x b.
-            aside = lens_moved[used] - length[:, None, None] * (_cross(bearing) @ turned[used])
-            aside[:, :, camera] += length[:, None, None] * by_camera[used, n]
-            normal = np.einsum("i,ijk->jk", weight, across)
-            right = np.einsum("i,ijk,ikl->jl", weight, across, aside)
-            try:
-                moved[3 * n : 3 * n + 3] = np.linalg.solve(normal, right)
-            except np.linalg.LinAlgError:
-                raise UnderconstrainedError(
-                    "the rays to a point are parallel, and no depth is known"
-                ) from None
+        rates = (self.drift, self.angular_drift, self.scale)
+        moved, meet = moved_points(shared_views(views), fit.points, fit.used, _seconds(views), rates)
+        if not meet:
+            raise UnderconstrainedError("the rays to a point are parallel, and no depth is known")
         return moved
 
 
@@ -230,11 +203,3 @@ def _camera_errors(views: Views) -> Array:
 def _largest_displacement(views: Views) -> float:
     """RMS length [rad] of what the camera's errors do to the bearing that feels them most."""
     return float(np.sqrt((_camera_errors(views) ** 2).sum(axis=(-2, -1)).max()))
-
-
-def _cross(vectors: Array) -> Array:
-    """(N, 3, 3) matrices whose product with v is the cross product with v."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x
-    return matrices - np.swapaxes(matrices, 1, 2)
