@@ -16,9 +16,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from knee_gap_core.values.arrays import Array
-from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit, points_jacobian
+from knee_gap_core.compiled import compiled
+from knee_gap_core.values.arrays import Array, Mask
+from knee_gap_uncertainty.multi_view.maximum_likelihood import MultiViewFit
 from knee_gap_uncertainty.multi_view.views import Views
+from knee_gap_uncertainty.numerics.vectors import Vector, cross, dot, norm, row, scale, subtract, unit, vector
 
 # [rad] by which a bearing would turn were its point at the first lens: below it a view does not measure
 # depth.
@@ -58,34 +60,88 @@ def single_view_drift(fit: MultiViewFit, views: Views, first_lens: Array) -> Arr
     error beside that turn is unknown as well. It is the first decile over the views that measure any. At most
     1: with no parallax at all, nothing is known.
     """
-    rays = fit.points - first_lens
-    observations = fit.points - views.lens_positions[:, None]
-    distances = np.linalg.norm(observations, axis=-1, keepdims=True)
-    bearings = observations / distances
-    turned = (rays - np.sum(rays * bearings, axis=-1, keepdims=True) * bearings) / distances
-    size = np.linalg.norm(turned, axis=-1)
-    known = fit.used & (size > LEAST_TURN)
-    towards = turned / np.where(known, size, 1.0)[..., None]
-    beside = np.cross(bearings, towards)
-    own, both, other = (
-        np.einsum("vni,vnij,vnj->vn", a, views.bearing_covariances, b)
-        for a, b in ((towards, towards), (towards, beside), (beside, beside))
-    )
-    spread = own - np.divide(both**2, other, out=np.zeros_like(own), where=other > 0.0)
-    variances = np.divide(spread, size**2, out=np.ones_like(size), where=known).clip(0.0, 1.0)
-    best = [np.quantile(variances[known[:, n], n], TOO_GOOD) if known[:, n].any() else 1.0 for n in range(2)]
-    return np.asarray(np.sqrt(best))
+    return _best_drifts(fit.points, views.lens_positions, views.bearing_covariances, fit.used, first_lens)
+
+
+@compiled
+def _best_drifts(points: Array, lens: Array, covariances: Array, used: Mask, first_lens: Array) -> Array:
+    """`single_view_drift` on plain arrays."""
+    drifts = np.ones(2)
+    variances = np.empty(lens.shape[0])
+    for n in range(2):
+        point, count = row(points, n), 0
+        ray = subtract(point, vector(first_lens))
+        for i in range(lens.shape[0]):
+            observation = subtract(point, row(lens, i))
+            distance = norm(observation)
+            bearing = scale(1.0 / distance, observation)
+            turned = scale(1.0 / distance, subtract(ray, scale(dot(ray, bearing), bearing)))
+            size = norm(turned)
+            if not (used[i, n] and size > LEAST_TURN):
+                continue
+            towards = scale(1.0 / size, turned)
+            beside = cross(bearing, towards)
+            spread = _form(covariances[i, n], towards, towards)
+            other = _form(covariances[i, n], beside, beside)
+            if other > 0.0:
+                spread -= _form(covariances[i, n], towards, beside) ** 2 / other
+            variances[count] = min(max(spread / size**2, 0.0), 1.0)
+            count += 1
+        if count > 0:
+            place = TOO_GOOD * (count - 1)
+            ordered = np.sort(variances[:count])
+            below = int(place)
+            above = min(below + 1, count - 1)
+            drifts[n] = np.sqrt(ordered[below] + (place - below) * (ordered[above] - ordered[below]))
+    return drifts
+
+
+@compiled
+def _form(matrix: Array, left: Vector, right: Vector) -> float:
+    """Bilinear form of a (3, 3) matrix."""
+    return dot(left, (dot(row(matrix, 0), right), dot(row(matrix, 1), right), dot(row(matrix, 2), right)))
 
 
 def widened(fit: MultiViewFit, added: Array) -> MultiViewFit:
     """The fit with a covariance (6, 6) [m^2] of both points added, as common part of its shares."""
-    inverse = np.linalg.inv(points_jacobian(fit.frames, fit.unknowns))
-    wider = replace(
-        fit,
-        covariance=fit.covariance + added,
-        unknowns_covariance=fit.unknowns_covariance + inverse @ added @ inverse.T,
+    covariance, unknowns_covariance, shares = _widened(
+        fit.covariance, fit.unknowns_covariance, fit.frames, fit.unknowns, fit.points, fit.shares, added
     )
-    kept = fit.gap_deviation**2 / wider.gap_deviation**2
-    shares = fit.shares * kept
-    shares[3] += 1.0 - kept
-    return replace(wider, shares=shares)
+    return replace(fit, covariance=covariance, unknowns_covariance=unknowns_covariance, shares=shares)
+
+
+@compiled
+def _widened(
+    covariance: Array,
+    unknowns_covariance: Array,
+    frames: Array,
+    unknowns: Array,
+    points: Array,
+    shares: Array,
+    added: Array,
+) -> tuple[Array, Array, Array]:
+    """The three fields that `widened` changes."""
+    inverse = np.zeros((6, 6))
+    gradient = np.zeros(6)
+    along = unit(subtract(row(points, 1), row(points, 0)))
+    for n in range(2):
+        a, b, rho = unknowns[n]
+        for k in range(3):
+            u = frames[n, 0, k]
+            inverse[3 * n, 3 * n + k] = rho * (frames[n, 1, k] - a * u)
+            inverse[3 * n + 1, 3 * n + k] = rho * (frames[n, 2, k] - b * u)
+            inverse[3 * n + 2, 3 * n + k] = -rho * rho * u
+            gradient[3 * n + k] = (2 * n - 1) * along[k]
+    before, after, wider = 0.0, 0.0, covariance + added
+    unknowns_added = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            before += gradient[i] * covariance[i, j] * gradient[j]
+            after += gradient[i] * wider[i, j] * gradient[j]
+            for k in range(6):
+                for m in range(6):
+                    unknowns_added[i, j] += inverse[i, k] * added[k, m] * inverse[j, m]
+    kept = before / after
+    changed = shares * kept
+    changed[3] += 1.0 - kept
+    return wider, unknowns_covariance + unknowns_added, changed
