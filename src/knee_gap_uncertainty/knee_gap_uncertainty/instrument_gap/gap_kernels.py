@@ -48,31 +48,51 @@ def mean_side(distance: float, angle: float, inset: float, shapes: Array) -> tup
 
 
 @compiled
-def side_range(
-    near: float, far: float, angle: float, inset: float, edge_error: float, image_error: float, shapes: Array
-) -> tuple[float, float]:
-    """Least and greatest `side` [m] that the admitted errors allow.
+def reaches_of(
+    near: float, far: float, inset: float, edge_error: float, image_error: float, shapes: Array
+) -> tuple[Array, Array]:
+    """Errors (EDGE_STEPS + 1,) [rad] of an edge, and how far away (EDGE_STEPS + 1, n, 4) [m] it lies then.
 
-    Distances lie from `near` to `far` [m]. The edge is wrong by up to `edge_error` [rad], which moves it
-    against axis and point alike, and the point against it by up to `image_error` [rad] more. The side is not
-    monotone in the edge's error, since an edge nearer to its point lies nearer to the lens.
+    Distances of the point beside it lie from `near` to `far` [m]. The edge is wrong by up to `edge_error`
+    [rad], which moves it against axis and point alike, and the point against it by up to `image_error` [rad]
+    more. The last axis holds the ends of both.
     """
-    least, greatest = np.inf, -np.inf
+    errors, reaches = np.empty(EDGE_STEPS + 1), np.empty((EDGE_STEPS + 1, shapes.shape[0], 4))
     for step in range(EDGE_STEPS + 1):
         if step < EDGE_STEPS:
             error = edge_error * (2.0 * step / (EDGE_STEPS - 1) - 1.0)
         else:
             # Where the point may lie on the line of sight along the edge.
             error = min(max(inset - image_error, -edge_error), edge_error)
-        for sign in (-1.0, 1.0):
-            moved = inset - error + sign * image_error
+        errors[step] = error
+        for place in range(4):
+            sine = np.sin(max(inset - error + (image_error if place % 2 else -image_error), 0.0))
+            distance = near if place < 2 else far
+            beside = distance * sine
             for k in range(shapes.shape[0]):
-                for distance in (near, far):
-                    if distance < np.inf:
-                        value = side(distance, angle + error, moved, shapes[k, 0], shapes[k, 1])
-                    else:
-                        value = np.inf if angle + error > 0.0 else -np.inf
-                    least, greatest = min(least, value), max(greatest, value)
+                radius, slope = shapes[k, 0], shapes[k, 1]
+                farther = np.sqrt(2.0 * radius * beside) if radius > 0.0 else beside / slope
+                reaches[step, k, place] = distance + farther if distance < np.inf else np.inf
+    return errors, reaches
+
+
+@compiled
+def side_range(errors: Array, reaches: Array, angle: float, shapes: Array) -> tuple[float, float]:
+    """Least and greatest `side` [m] that the admitted errors (`reaches_of`) allow, at an angle.
+
+    The side is not monotone in the edge's error, since an edge nearer to its point lies nearer to the lens.
+    """
+    least, greatest = np.inf, -np.inf
+    for step in range(errors.size):
+        wrong = angle + errors[step]
+        sine, fallen = np.sin(wrong), 1.0 - np.cos(wrong)
+        endless = np.inf if wrong > 0.0 else -np.inf
+        for k in range(shapes.shape[0]):
+            bulge = shapes[k, 0] * fallen
+            for place in range(4):
+                reach = reaches[step, k, place]
+                value = reach * sine - bulge if reach < np.inf else endless
+                least, greatest = min(least, value), max(greatest, value)
     return least, greatest
 
 
@@ -184,7 +204,7 @@ def ranges_under_errors(
 
 
 @compiled
-def least_gap(
+def gap_bounds(
     near: Array,
     far: Array,
     half: float,
@@ -194,37 +214,21 @@ def least_gap(
     shapes_0: Array,
     shapes_1: Array,
     tilts: Array,
-) -> float:
-    """Gap [m] that is free whatever the admitted errors, at the tilt where most is.
+) -> tuple[float, float]:
+    """Gap [m] that is free whatever the admitted errors, at the tilt where most is, and what none exceeds.
 
-    Only within the lines of sight along the edges is tissue known to be absent.
+    The first is that of tilts within the lines of sight along the edges: only there tissue is known to be
+    absent. The second is that of any tilt.
     """
-    best = 0.0
+    first, second = (
+        reaches_of(near[0], far[0], insets[0], edge_error, image_error, shapes_0),
+        reaches_of(near[1], far[1], insets[1], edge_error, image_error, shapes_1),
+    )
+    free, greatest = 0.0, 0.0
     for k in range(tilts.size):
-        if abs(tilts[k]) > max(half - edge_error, 0.0):
-            continue
-        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
-        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
-        best = max(best, first[0] + second[0])
-    return best
-
-
-@compiled
-def greatest_gap(
-    near: Array,
-    far: Array,
-    half: float,
-    insets: Array,
-    edge_error: float,
-    image_error: float,
-    shapes_0: Array,
-    shapes_1: Array,
-    tilts: Array,
-) -> float:
-    """Gap [m] that no admitted error exceeds, at any tilt."""
-    best = 0.0
-    for k in range(tilts.size):
-        first = side_range(near[0], far[0], half + tilts[k], insets[0], edge_error, image_error, shapes_0)
-        second = side_range(near[1], far[1], half - tilts[k], insets[1], edge_error, image_error, shapes_1)
-        best = max(best, first[1] + second[1])
-    return best
+        one = side_range(first[0], first[1], half + tilts[k], shapes_0)
+        other = side_range(second[0], second[1], half - tilts[k], shapes_1)
+        if abs(tilts[k]) <= max(half - edge_error, 0.0):
+            free = max(free, one[0] + other[0])
+        greatest = max(greatest, one[1] + other[1])
+    return free, greatest

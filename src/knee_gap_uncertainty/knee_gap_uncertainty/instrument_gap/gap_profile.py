@@ -11,7 +11,7 @@ import numpy as np
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import SectionEdges
-from knee_gap_uncertainty.instrument_gap.gap_kernels import greatest_gap, least_gap, widest
+from knee_gap_uncertainty.instrument_gap.gap_kernels import gap_bounds, widest
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
     ROUGHNESS_BOUND,
     TILTS,
@@ -86,8 +86,7 @@ def gap_profile(
         near, far = (np.maximum(near_far[0] * farther - wrong, 1e-4), near_far[1] * farther + wrong)
         gap = widest(here.half, ranges * farther, opening.insets, *edges.shapes, TILTS)[0]
         errors = (section.error, 0.0)
-        lower = least_gap(near, far, here.half, opening.insets, *errors, *edges.shapes, TILTS)
-        upper = greatest_gap(near, far, here.half, opening.insets, *errors, *edges.shapes, TILTS)
+        lower, upper = gap_bounds(near, far, here.half, opening.insets, *errors, *edges.shapes, TILTS)
         rows.append((position, gap, max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND))
     position, gap, lower, upper = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     known = np.flatnonzero(np.isfinite(position))

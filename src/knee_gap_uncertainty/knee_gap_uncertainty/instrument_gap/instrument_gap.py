@@ -27,8 +27,7 @@ from knee_gap_uncertainty.instrument_gap.gap_kernels import (
     TINY,
     edge_slopes,
     ends_over_ellipse,
-    greatest_gap,
-    least_gap,
+    gap_bounds,
     mean_farther,
     mean_side,
     opening_between,
@@ -250,6 +249,5 @@ def bounds_of_gap(
     if not near.size:
         return 0.0, np.inf
     errors = (edges.error, image_error)
-    lower = least_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
-    upper = greatest_gap(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
+    lower, upper = gap_bounds(near, far, opening.half, opening.insets, *errors, *edges.shapes, TILTS)
     return max(lower - ROUGHNESS_BOUND, 0.0), upper + ROUGHNESS_BOUND
