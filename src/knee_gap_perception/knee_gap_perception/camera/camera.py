@@ -18,6 +18,9 @@ NO_TERM = 1e-30  # [-] relative to a polynomial's largest term: smaller terms ar
 class Camera(Protocol):
     """Interface of a camera model."""
 
+    def __hash__(self) -> int:
+        """As of any value that does not change."""
+
     @property
     def width_px(self) -> int:
         """Columns of the image."""

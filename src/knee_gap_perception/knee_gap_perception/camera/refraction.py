@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from knee_gap_core.values.arrays import Array
 from knee_gap_perception.camera.camera import Camera, Coarseness
+from knee_gap_perception.camera.window_kernel import refracted_rays
 from knee_gap_perception.errors import PerceptionError
 
 
@@ -16,13 +17,9 @@ def refracted(bearings: npt.ArrayLike, index_ratio: float) -> Array:
     `index_ratio` is the sine of the angle after the window to that before it. NaN for directions along or
     against the window and for rays that it reflects totally.
     """
-    ray = np.asarray(bearings, dtype=np.float64)
-    length = np.linalg.norm(ray, axis=-1, keepdims=True)
-    side = index_ratio * ray[..., :2] / np.where(length > 0, length, np.nan)
-    square = 1.0 - (side * side).sum(axis=-1, keepdims=True)
-    passes = (square > 0) & (ray[..., 2:] > 0)
-    ahead = np.sqrt(np.where(passes, square, np.nan))
-    return np.concatenate([np.where(passes, side, np.nan), ahead], axis=-1)
+    given = np.asarray(bearings, dtype=np.float64)
+    flat = np.ascontiguousarray(given.reshape(-1, 3))
+    return refracted_rays(flat, float(index_ratio)).reshape(given.shape)
 
 
 @dataclass(frozen=True)

@@ -310,7 +310,8 @@ class GapEdgeTracker:
         """
         inside = _sparse_inside(field, (picture.shape[0], picture.shape[1]))
         try:
-            check_light(picture[8::16, 8::16].max(axis=2)[inside])
+            blue, green, red = np.moveaxis(picture[8::16, 8::16], 2, 0)
+            check_light(np.maximum(np.maximum(blue, green), red)[inside])
         except NoPointsError:
             if stamp_ns - self._seen_ns > 1e9 * self.parameters.maximum_unseen:
                 self.end_track()

@@ -25,6 +25,7 @@ from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_nam
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the image is too dark
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
+BRIGHT_QUANTILE = 0.95  # of the values, below that of the brightest twentieth
 OVEREXPOSED_SHARE = 0.7  # of the field
 REFRESH_EVERY = 30  # images of a track between measurements of the tissue's warmth: white balance drifts
 
@@ -190,12 +191,22 @@ def check_light(values: Image) -> float:
 
     Raises NoPointsError if the image is too dark or overexposed.
     """
-    light = float(np.percentile(values, 95)) if values.size else 0.0
+    light = _level_exceeded(values) if values.size else 0.0
     if light < DARK_PICTURE:
         raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the image is too dark")
     if (values >= BRIGHT_PICTURE).mean() > OVEREXPOSED_SHARE:
         raise NoPointsError(EdgeStatus.LOW_CONTRAST, "the image is overexposed")
     return light
+
+
+def _level_exceeded(values: Image) -> float:
+    """The 95th percentile, as numpy's, which takes five times as long for so few."""
+    ordered = np.sort(values, axis=None)
+    place = BRIGHT_QUANTILE * (ordered.size - 1)
+    below = int(place)
+    lower, upper = float(ordered[below]), float(ordered[min(below + 1, ordered.size - 1)])
+    share, step = place - below, upper - lower
+    return lower + step * share if share < 0.5 else upper - step * (1.0 - share)
 
 
 def _settings(parameters: EdgeParameters) -> dict[str, object]:

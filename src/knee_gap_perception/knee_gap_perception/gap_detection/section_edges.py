@@ -218,7 +218,7 @@ class SectionEdgeFinder:
         radius = 0.3 * half if self._circle is None else 0.5 * self._circle.radius
         reach = max(int(radius), 4)
         rows = np.abs(strip.rows) <= max(radius, ROW_STEP)
-        return float(np.median(strip.values[rows, strip.middle - reach : strip.middle + reach + 1]))
+        return _median(strip.values[rows, strip.middle - reach : strip.middle + reach + 1])
 
     def _turn(self, circle: Circle, rows: Array, borders: tuple[Borders, Borders], share: float) -> None:
         """Rotate the direction across towards the line between the circle's two contacts."""
@@ -315,4 +315,13 @@ def _tissue_level(grey: Image, pixel: Array) -> float:
     """Brightness of the tissue around a tracked point."""
     column, row = np.rint(pixel).astype(int)
     patch = grey[max(0, row - 8) : max(0, row + 9), max(0, column - 8) : max(0, column + 9)]
-    return float(np.median(patch)) if patch.size else 0.0
+    return _median(patch) if patch.size else 0.0
+
+
+def _median(values: Image) -> float:
+    """Median, NaN of no values: numpy's takes five times as long for so few."""
+    ordered = np.sort(values, axis=None)
+    middle = ordered.size // 2
+    if ordered.size % 2:
+        return float(ordered[middle])
+    return 0.5 * (float(ordered[middle - 1]) + float(ordered[middle])) if ordered.size else float("nan")

@@ -1,6 +1,7 @@
 """Detection of the field of view: the disc of the image that the scope fills."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -148,10 +149,9 @@ class FieldOfViewFinder:
         """Whether there is picture well outside the disc, and whether there is none along its rim."""
         assert self._field is not None
         step = max(1, min(image.shape[:2]) // 40)
-        grid = image[step // 2 :: step, step // 2 :: step].max(axis=2)
-        rows, columns = np.mgrid[0 : grid.shape[0], 0 : grid.shape[1]] * step + step // 2
-        away = np.hypot(columns - self._field.centre[0], rows - self._field.centre[1]) / self._field.radius
-        outside, rim = away > 1.05, (away > 0.8) & (away < 0.97)
+        blue, green, red = np.moveaxis(image[step // 2 :: step, step // 2 :: step], 2, 0)
+        grid = np.maximum(np.maximum(blue, green), red)
+        outside, rim = _outside_and_rim(self._field, (grid.shape[0], grid.shape[1]), step)
         # A gap crosses the rim in two places and leaves most of it lit.
         return (
             bool(outside.any() and (grid[outside] > 60).mean() > 0.1),
@@ -162,3 +162,11 @@ class FieldOfViewFinder:
         """Whether an image shows, on a coarse grid, that the disc is another one."""
         beyond, dark_rim = self._misfit(image)
         return dark_rim or (beyond and not self._light_surround)
+
+
+@lru_cache(maxsize=4)
+def _outside_and_rim(field: FieldOfView, shape: tuple[int, int], step: int) -> tuple[Mask, Mask]:
+    """Which of every `step`-th pixel of every `step`-th line lie well outside a disc, and at its rim."""
+    rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]] * step + step // 2
+    away = np.hypot(columns - field.centre[0], rows - field.centre[1]) / field.radius
+    return away > 1.05, (away > 0.8) & (away < 0.97)

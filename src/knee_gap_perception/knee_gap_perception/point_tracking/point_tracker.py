@@ -10,6 +10,7 @@ and what shape it will have; otherwise the last image and even motion do.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -135,19 +136,16 @@ class PointTracker:
 
     def follow(self, grey: Image, camera: Camera, view: View | None) -> PointObservation:
         """The point in the next image (h, w), and the view it was taken from where that is known."""
-        predictions = {index: self._predict(index, camera, view) for index in self._candidates()}
-        best: tuple[int, Registration] | None = None
-        for index, prediction in predictions.items():
+        for index in self._candidates():
             anchor = self._anchors[index]
+            prediction = self._predict(index, camera, view)
             found = self._find(anchor.patch, prediction, grey)
             believed = found is not None and _believable(found, prediction, self._fair(view, prediction))
             anchor.rest = 0 if believed else REST
             if found is not None and believed:
-                best = (index, found)
-                break
-        if best is None:
-            return self._coast(predictions[len(self._anchors) - 1])
-        return self._accept(best[0], best[1], predictions[best[0]], grey, view)
+                return self._accept(index, found, prediction, grey, view)
+        # The last one that was tried is that of the newest patch.
+        return self._coast(prediction)
 
     def _find(self, patch: Patch, prediction: Prediction, grey: Image) -> Registration | None:
         """The patch where it is predicted; None if nothing can be seen of it there.
@@ -176,13 +174,15 @@ class PointTracker:
 
     def _candidates(self) -> list[int]:
         """Patches to try: the earliest that should look alike, then the newest."""
-        mild = []
+        mild: int | None = None
         for index, anchor in enumerate(self._anchors):
             anchor.rest = max(0, anchor.rest - 1)
-            if not anchor.rest and _strain(self._warp.shape @ np.linalg.inv(anchor.shape)) < MILD:
-                mild.append(index)
+            if mild is not None or anchor.rest:
+                continue
+            if _strain(self._warp.shape @ np.linalg.inv(anchor.shape)) < MILD:
+                mild = index
         newest = len(self._anchors) - 1
-        return list(dict.fromkeys([*mild[:1], newest]))
+        return [newest] if mild is None or mild == newest else [mild, newest]
 
     def _fair(self, view: View | None, prediction: Prediction) -> float:
         """Correlation below which a patch was not found: in a wide search mere noise finds a likeness."""
@@ -221,9 +221,7 @@ class PointTracker:
         score = cv2.matchTemplate(
             surface.texture[window] * surface.weight[window], drawn, cv2.TM_CCORR_NORMED
         )
-        rows, columns = np.mgrid[0 : score.shape[0], 0 : score.shape[1]]
-        away = np.hypot(rows - reach, columns - reach) / reach
-        row, column = np.unravel_index(int((score - 0.3 * away**2).argmax()), score.shape)
+        row, column = np.unravel_index(int((score - _penalty_of_place(reach)).argmax()), score.shape)
         return Warp(warp.position + np.array([column - reach, row - reach], float), warp.shape)
 
     def _coast(self, prediction: Prediction) -> PointObservation:
@@ -266,6 +264,14 @@ class PointTracker:
         along, across = np.square(self._parallax_error)
         size = float(parallax @ parallax)
         return np.asarray((along - across) * np.outer(parallax, parallax) + across * size * np.eye(2))
+
+
+@lru_cache(maxsize=SEARCH)
+def _penalty_of_place(reach: int) -> Array:
+    """What is taken from the score (2 reach + 1, ...) of places away from the middle."""
+    rows, columns = np.mgrid[0 : 2 * reach + 1, 0 : 2 * reach + 1]
+    away = np.hypot(rows - reach, columns - reach) / reach
+    return np.asarray(0.3 * away**2)
 
 
 def _level(grey: Image, position: Array) -> float:

@@ -6,6 +6,7 @@ homography that a plane induces (Hartley and Zisserman, 13.1). m is a Gaussian w
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -22,6 +23,9 @@ MEMORY = 0.15  # [-] travel, against the distance, over which registrations are 
 LEAST_TRAVEL = 0.01  # [-] travel, against the distance, from which a registration adds information
 FARTHEST_PX = 1e6  # [px] from the image, beyond which a prediction is not used
 DIFFERENCE = 4.0  # [px] between the points whose images give the shape
+CORNERS = DIFFERENCE * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
+STEP = 0.01 / TYPICAL_DISTANCE  # [1/m] between the planes whose images give the derivatives
+PLANE_STEPS = STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 
 
 @dataclass(frozen=True)
@@ -82,21 +86,19 @@ class TangentPlane:
         return prediction if np.abs(prediction.warp.position).max() < FARTHEST_PX else None
 
     def _predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
-        corners = anchor_pixel + DIFFERENCE * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
-        bearings = camera.bearings(corners)
-        step = 0.01 / TYPICAL_DISTANCE
-        planes = self.mean + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        seen = self._see(planes, bearings, anchor, view)
-        pixels = camera.pixels(seen)
+        bearings = _corner_bearings(camera, float(anchor_pixel[0]), float(anchor_pixel[1]))
+        seen = self._see(self.mean + PLANE_STEPS, bearings, anchor, view)
         turned = bearings[0] @ anchor.T_world_lens[:3, :3].T @ view.T_world_lens[:3, :3]
-        parallax = pixels[0, 0] - camera.pixels(turned)
-        if not (np.isfinite(pixels).all() and np.isfinite(parallax).all()):
+        every = camera.pixels(np.concatenate([seen.reshape(-1, 3), turned[None]]))
+        if not np.isfinite(every).all():
             return None
+        pixels = every[:-1].reshape(*seen.shape[:2], 2)
+        parallax = pixels[0, 0] - every[-1]
         shape_x = (pixels[:, 1] - pixels[:, 2]) / (2 * DIFFERENCE)
         shape_y = (pixels[:, 3] - pixels[:, 4]) / (2 * DIFFERENCE)
         shapes = np.stack([shape_x, shape_y], axis=-1)
         parameters = np.concatenate([pixels[:, 0], shapes.reshape(-1, 4)], axis=1)
-        jacobian = ((parameters[1:4] - parameters[4:7]) / (2 * step)).T
+        jacobian = ((parameters[1:4] - parameters[4:7]) / (2 * STEP)).T
         noise = self._pose_noise(camera, parameters[0, :2], anchor, view)
         covariance = jacobian @ self.covariance @ jacobian.T + noise
         return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian, parallax)
@@ -157,6 +159,12 @@ class TangentPlane:
         )
         error_px = angle / camera.radians_per_pixel(pixel)
         return np.diag([error_px**2] * 2 + [SHAPE_NOISE**2] * 4)
+
+
+@lru_cache(maxsize=64)
+def _corner_bearings(camera: Camera, column: float, row: float) -> Array:
+    """Bearings (5, 3) at a pixel of an anchor, which stays the same, and around it."""
+    return camera.bearings(np.array([column, row]) + CORNERS)
 
 
 def _inverse(T: Array) -> Array:
