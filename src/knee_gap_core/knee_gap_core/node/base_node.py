@@ -1,5 +1,6 @@
 """The base of every node: parameters, QoS by purpose, diagnostics, and one way to start and to stop."""
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -66,9 +67,15 @@ class GuardedNode(Node):
         for event in EVENTS:
             if (handler := getattr(events, event, None)) is not None:
                 setattr(events, event, self.guarded(f"{event} of {topic}", handler))
-        return super().create_subscription(
-            msg_type, topic, self.guarded(f"message on {topic}", callback), *options, **named
-        )
+        guarded = self.guarded(f"message on {topic}", callback)
+
+        @functools.wraps(callback)
+        def taken(*arguments: Any) -> None:
+            # EventsExecutor hands over a message and what is known of it as one tuple.
+            one_tuple = len(arguments) == 1 and isinstance(arguments[0], tuple)
+            guarded(*arguments[0] if one_tuple else arguments)
+
+        return super().create_subscription(msg_type, topic, taken, *options, **named)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *options: Any, **named: Any
