@@ -43,9 +43,8 @@ def bearing_jacobian(camera: Camera, pixel: npt.ArrayLike) -> Array:
     """Change of the bearing with the pixel (3, 2) [1/px] at a pixel (2,), by central differences."""
     u, v = np.asarray(pixel, dtype=np.float64)
     step = 0.25
-    b = camera.bearings([[u + step, v], [u - step, v], [u, v + step], [u, v - step]])
-    jacobian: Array = np.stack([b[0] - b[1], b[2] - b[3]], axis=1) / (2 * step)
-    return jacobian
+    b = camera.bearings(np.array([[u + step, v], [u - step, v], [u, v + step], [u, v - step]]))
+    return np.ascontiguousarray((b[::2] - b[1::2]).T) / (2 * step)
 
 
 class Coarseness:

@@ -8,6 +8,7 @@ from knee_gap_core.values import quaternions
 from knee_gap_core.values.edges import EdgeStatus
 from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
+from knee_gap_perception.point_tracking.tangent_plane import TangentPlane, View
 
 HEIGHT, WIDTH = 720, 1280
 RADIUS = 350
@@ -35,6 +36,16 @@ def warm_up() -> EdgeStatus:
     status = EdgeStatus.UNKNOWN
     for k in range(4):
         status = detector.process(1 + 16_666_667 * k, picture(2 * k), camera).status
-    # Used once there are poses.
-    camera.pixels(camera.bearings([[0.0, 0.0]]))
+    _follow_a_plane(camera)
     return status
+
+
+def _follow_a_plane(camera: FisheyeCamera) -> None:
+    """Run what is used once there are poses of the lens."""
+    pixel, moved = np.array([WIDTH / 2, HEIGHT / 2 + 60.0]), np.eye(4)
+    moved[0, 3] = 1e-3
+    first, view = (View(pose, 1e-5, 1e-5) for pose in (np.eye(4), moved))
+    plane = TangentPlane(camera.bearings(pixel), first)
+    prediction = plane.predict(camera, first, pixel, view)
+    assert prediction is not None
+    plane.learn(prediction, prediction.warp.parameters, prediction.covariance, view)

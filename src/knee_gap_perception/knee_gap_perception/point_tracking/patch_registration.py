@@ -55,6 +55,11 @@ class Warp:
     position: Array
     shape: Array
 
+    @property
+    def parameters(self) -> Array:
+        """Position x, y and shape xx, xy, yx, yy (6,)."""
+        return np.concatenate([self.position, self.shape.reshape(-1)])
+
 
 @dataclass(frozen=True)
 class Registration:

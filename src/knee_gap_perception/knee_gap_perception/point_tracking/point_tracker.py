@@ -25,6 +25,7 @@ from knee_gap_perception.point_tracking.patch_registration import (
     Warp,
     surface_around,
 )
+from knee_gap_perception.point_tracking.plane_kernel import strain_of, worst_deviation
 from knee_gap_perception.point_tracking.tangent_plane import Prediction, TangentPlane, View
 
 PATCH_HALF = 48  # [px] half side of a patch
@@ -179,7 +180,7 @@ class PointTracker:
             anchor.rest = max(0, anchor.rest - 1)
             if mild is not None or anchor.rest:
                 continue
-            if _strain(self._warp.shape @ np.linalg.inv(anchor.shape)) < MILD:
+            if strain_of(self._warp.shape @ np.linalg.inv(anchor.shape)) < MILD:
                 mild = index
         newest = len(self._anchors) - 1
         return [newest] if mild is None or mild == newest else [mild, newest]
@@ -188,7 +189,7 @@ class PointTracker:
         """Correlation below which a patch was not found: in a wide search mere noise finds a likeness."""
         if self._plane is None or view is None:
             return FAIR_ALONE
-        width = min(_spread(prediction) / WIDE, 1.0)
+        width = min(worst_deviation(prediction.covariance) / WIDE, 1.0)
         return FAIR + (FAIR_WIDE - FAIR) * width
 
     def _predict(self, index: int, camera: Camera, view: View | None) -> Prediction:
@@ -215,7 +216,7 @@ class PointTracker:
         matrix = np.concatenate([inverse, (centre - inverse @ centre)[:, None]], axis=1)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         drawn = cv2.warpAffine(patch.texture * patch.weight, matrix, (side, side), flags=flags)
-        reach = int(np.clip(np.ceil(3.0 * _spread(prediction)), 3, SEARCH))
+        reach = int(np.clip(np.ceil(3.0 * worst_deviation(prediction.covariance)), 3, SEARCH))
         first = np.rint(warp.position - np.array(surface.origin)).astype(int) - PATCH_HALF - reach
         window = np.s_[first[1] : first[1] + side + 2 * reach, first[0] : first[0] + side + 2 * reach]
         score = cv2.matchTemplate(
@@ -247,10 +248,9 @@ class PointTracker:
         self._warp = Warp(found.warp.position, found.warp.shape @ anchor.shape)
         self._covariance = covariance
         if self._plane is not None and view is not None:
-            parameters = np.concatenate([found.warp.position, found.warp.shape.reshape(-1)])
-            self._plane.learn(prediction, parameters, found.covariance, view)
+            self._plane.learn(prediction, found.warp.parameters, found.covariance, view)
         newest = index == len(self._anchors) - 1
-        strained = _strain(found.warp.shape) > MILD or found.correlation < FRESH
+        strained = strain_of(found.warp.shape) > MILD or found.correlation < FRESH
         clear = found.correlation > GOOD and found.seen > CLEAR
         if newest and strained and clear and index < MAXIMUM_PATCHES:
             grown = own + HANDOVER_ERROR**2 * np.eye(2)
@@ -283,20 +283,6 @@ def _level(grey: Image, position: Array) -> float:
     return float(ordered[(3 * (ordered.size - 1)) // 4]) if ordered.size else 0.0
 
 
-def _spread(prediction: Prediction) -> float:
-    """Standard deviation [px] of a predicted position, in its worse direction."""
-    return float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
-
-
-def _strain(shape: Array) -> float:
-    """How far a shape (2, 2) is from none: the largest logarithm of stretch, or the turn [rad]."""
-    stretches = np.linalg.svd(shape, compute_uv=False)
-    if stretches.min() <= 1e-6:
-        return float("inf")
-    turn = abs(np.arctan2(shape[1, 0] - shape[0, 1], shape[0, 0] + shape[1, 1]))
-    return float(max(np.abs(np.log(stretches)).max(), turn))
-
-
 def _can_be_seen(prediction: Prediction, grey: Image) -> bool:
     """Whether a patch may be looked for where it is predicted: near the image, and not squeezed to a line."""
     position, shape = prediction.warp.position, prediction.warp.shape
@@ -305,7 +291,7 @@ def _can_be_seen(prediction: Prediction, grey: Image) -> bool:
         return False
     size = np.array([grey.shape[1], grey.shape[0]])
     near = bool((position > -CROP_HALF).all() and (position < size + CROP_HALF).all())
-    return near and _strain(shape) < MOST_STRAIN
+    return near and strain_of(shape) < MOST_STRAIN
 
 
 def _believable(found: Registration, prediction: Prediction, fair: float) -> bool:
@@ -315,6 +301,6 @@ def _believable(found: Registration, prediction: Prediction, fair: float) -> boo
         found.correlation > fair
         and found.seen > MINIMUM_SEEN
         and distance < 25.0
-        and _strain(found.warp.shape) < 1.2
+        and strain_of(found.warp.shape) < 1.2
         and bool(np.isfinite(found.covariance).all())
     )

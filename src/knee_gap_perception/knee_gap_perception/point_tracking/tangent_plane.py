@@ -14,6 +14,7 @@ from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera import Camera
 from knee_gap_perception.point_tracking.patch_registration import Warp
+from knee_gap_perception.point_tracking.plane_kernel import directions_of, learnt_plane, prediction_of
 
 TYPICAL_DISTANCE = 0.012  # [m] from lens to tissue in a joint
 DISTANCE_SPREAD = 0.6  # [-] standard deviation of the inverse distance, against the typical one
@@ -87,21 +88,15 @@ class TangentPlane:
 
     def _predict(self, camera: Camera, anchor: View, anchor_pixel: Array, view: View) -> Prediction | None:
         bearings = _corner_bearings(camera, float(anchor_pixel[0]), float(anchor_pixel[1]))
-        seen = self._see(self.mean + PLANE_STEPS, bearings, anchor, view)
-        turned = bearings[0] @ anchor.T_world_lens[:3, :3].T @ view.T_world_lens[:3, :3]
-        every = camera.pixels(np.concatenate([seen.reshape(-1, 3), turned[None]]))
-        if not np.isfinite(every).all():
+        poses = (self._first.T_world_lens, anchor.T_world_lens, view.T_world_lens)
+        pixels = camera.pixels(directions_of(self.mean + PLANE_STEPS, bearings, *poses))
+        if not np.isfinite(pixels).all():
             return None
-        pixels = every[:-1].reshape(*seen.shape[:2], 2)
-        parallax = pixels[0, 0] - every[-1]
-        shape_x = (pixels[:, 1] - pixels[:, 2]) / (2 * DIFFERENCE)
-        shape_y = (pixels[:, 3] - pixels[:, 4]) / (2 * DIFFERENCE)
-        shapes = np.stack([shape_x, shape_y], axis=-1)
-        parameters = np.concatenate([pixels[:, 0], shapes.reshape(-1, 4)], axis=1)
-        jacobian = ((parameters[1:4] - parameters[4:7]) / (2 * STEP)).T
-        noise = self._pose_noise(camera, parameters[0, :2], anchor, view)
-        covariance = jacobian @ self.covariance @ jacobian.T + noise
-        return Prediction(Warp(parameters[0, :2], shapes[0]), covariance, jacobian, parallax)
+        noise = self._position_noise(camera, pixels[0], anchor, view)
+        position, shape, covariance, jacobian, parallax = prediction_of(
+            pixels, self.covariance, noise, SHAPE_NOISE, DIFFERENCE, STEP
+        )
+        return Prediction(Warp(position, shape), covariance, jacobian, parallax)
 
     def learn(self, prediction: Prediction, found: Array, covariance: Array, view: View) -> None:
         """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction.
@@ -117,59 +112,31 @@ class TangentPlane:
             return
         self._learnt_at = lens
         try:
-            learnt = self._learnt(prediction, found, covariance, float(np.exp(-moved / MEMORY)))
+            learnt = learnt_plane(
+                self.mean,
+                self.covariance,
+                self._prior_information,
+                prediction.jacobian,
+                (prediction.warp.parameters, prediction.covariance),
+                (found, covariance),
+                float(np.exp(-moved / MEMORY)),
+            )
         except np.linalg.LinAlgError:
             return  # nothing can be learnt from numbers that are singular to the last digit
         if all(np.isfinite(values).all() for values in learnt):
             self.mean, self.covariance = learnt
 
-    def _learnt(
-        self, prediction: Prediction, found: Array, covariance: Array, kept: float
-    ) -> tuple[Array, Array]:
-        """The mean and covariance of the plane after a registration, `kept` [0, 1] of what was known."""
-        prior = np.linalg.inv(prediction.covariance)
-        learned = (1.0 - kept) * (np.linalg.inv(covariance) - prior)
-        predicted = np.concatenate([prediction.warp.position, prediction.warp.shape.reshape(-1)])
-        posterior = np.linalg.inv(prior + learned)
-        change = (1.0 - kept) * posterior @ np.linalg.solve(covariance, found - predicted)
-        gain = self.covariance @ prediction.jacobian.T @ prior
-        mean = self.mean + gain @ change
-        updated = self.covariance - gain @ (prediction.covariance - posterior) @ gain.T
-        information = kept * np.linalg.inv((updated + updated.T) / 2) + (1.0 - kept) * self._prior_information
-        loosened = np.linalg.inv(information)
-        return mean, (loosened + loosened.T) / 2
-
-    def _see(self, planes: Array, bearings: Array, anchor: View, view: View) -> Array:
-        """Directions (m, n, 3) from a view, to points of planes (m, 3) along bearings (n, 3) of an anchor."""
-        T_first_anchor = _inverse(self._first.T_world_lens) @ anchor.T_world_lens
-        R, t = T_first_anchor[:3, :3], T_first_anchor[:3, 3]
-        local = planes @ R / (1.0 - planes @ t)[:, None]
-        T_anchor_view = _inverse(anchor.T_world_lens) @ view.T_world_lens
-        inverse_distances = local @ bearings.T
-        moved = bearings - inverse_distances[..., None] * T_anchor_view[:3, 3]
-        # Inverse distances below zero lie behind the lens.
-        return np.where((inverse_distances > 0)[..., None], moved @ T_anchor_view[:3, :3], np.nan)
-
-    def _pose_noise(self, camera: Camera, pixel: Array, anchor: View, view: View) -> Array:
-        """What the errors of both poses do to the parameters (6, 6)."""
+    def _position_noise(self, camera: Camera, pixel: Array, anchor: View, view: View) -> float:
+        """Standard deviation of the position [px] by the errors of both poses."""
         inverse_distance = float(np.linalg.norm(self.mean))
         angle = np.hypot(
             inverse_distance * np.hypot(anchor.position_error, view.position_error),
             np.hypot(anchor.rotation_error, view.rotation_error),
         )
-        error_px = angle / camera.radians_per_pixel(pixel)
-        return np.diag([error_px**2] * 2 + [SHAPE_NOISE**2] * 4)
+        return float(angle / camera.radians_per_pixel(pixel))
 
 
 @lru_cache(maxsize=64)
 def _corner_bearings(camera: Camera, column: float, row: float) -> Array:
     """Bearings (5, 3) at a pixel of an anchor, which stays the same, and around it."""
     return camera.bearings(np.array([column, row]) + CORNERS)
-
-
-def _inverse(T: Array) -> Array:
-    """Inverse of a rigid transform (4, 4)."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = T[:3, :3].T
-    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return inverse
