@@ -28,7 +28,14 @@ LEVEL_OFFSET = 5.0  # [grey levels]: so that the noise of black does not count a
 
 
 def gap_confidence(
-    section: Section, field_radius: float, light: float, image: Image, dark: Mask, scale: float
+    section: Section,
+    field_radius: float,
+    light: float,
+    image: Image,
+    dark: Mask,
+    scale: float,
+    *,
+    pointed_at: bool = False,
 ) -> float:
     """Confidence [0, 1] that a section through dark pixels (h, w) of an image (h, w, 3) is a gap.
 
@@ -41,7 +48,11 @@ def gap_confidence(
     wall of the same tissue is darker in all of them.
 
     `image` and `dark` are reduced by `scale`; `field_radius` [px] is in the pixels of the section, `light`
-    [grey levels] the brightness of fully lit tissue.
+    [grey levels] the brightness of fully lit tissue. How even other dark parts are, such as the shade at the
+    rim of the field, does not matter.
+
+    Where a person has `pointed_at` it, an organ or an instrument is not in question, only a crease: colour,
+    unevenness and width, which tell those apart, do not count.
     """
     sharper = float(section.sharpness.max())
     lit = min(float(section.levels[1:].max()) / light, 1.0)
@@ -50,11 +61,15 @@ def gap_confidence(
         + BLUNT_WEIGHT * float(section.sharpness.min())
         + SHARP_WEIGHT * sharper
         + SHADE_WEIGHT * (1.0 - sharper) * (1.0 - lit)
-        + UNEVENNESS_WEIGHT * min(unevenness(image, dark), MOST_UNEVEN)
-        + PIGMENT_WEIGHT * pigment(section, image, scale)
-        + SLIT_WEIGHT * np.log(np.clip(section.radius / field_radius, NARROWEST, WIDE) / WIDE)
         + OFFSET
     )
+    if not pointed_at:
+        part = dark if section.part is None else section.part
+        evidence += (
+            UNEVENNESS_WEIGHT * min(unevenness(image, part), MOST_UNEVEN)
+            + PIGMENT_WEIGHT * pigment(section, image, scale)
+            + SLIT_WEIGHT * np.log(np.clip(section.radius / field_radius, NARROWEST, WIDE) / WIDE)
+        )
     return float(1.0 / (1.0 + np.exp(-evidence)))
 
 

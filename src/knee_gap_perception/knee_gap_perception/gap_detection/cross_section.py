@@ -24,7 +24,8 @@ class Section:
 
     `levels` (3,) is the brightness of gap, tissue beyond edge 0 and tissue beyond edge 1; `contrast` (2,) the
     step at each edge relative to the tissue's brightness; `sharpness` (2,) that of the border on each side
-    (`border_sharpness`). Lengths are in pixels of the full image.
+    (`border_sharpness`). `part` (h, w) is the dark part that it leads through, at working size. Lengths are
+    in pixels of the full image.
     """
 
     centre: Array
@@ -33,6 +34,7 @@ class Section:
     contrast: Array
     levels: Array
     sharpness: Array
+    part: Mask | None = None
 
     @property
     def across(self) -> Array:
@@ -152,6 +154,7 @@ def _section_through(
         contrast=contrast,
         levels=levels,
         sharpness=border_sharpness(part, centre, directions[narrowest], value, foreign, field, scale),
+        part=part,
     )
 
 

@@ -143,7 +143,9 @@ class GapSearch:
                 f"the dark part is {np.degrees(width):.1f} deg wide, a gap is at least "
                 f"{np.degrees(self.parameters.minimum_width):.1f} deg",
             )
-        confidence = self.confidence = gap_confidence(section, field.extent, light, small, dark, scale)
+        confidence = self.confidence = gap_confidence(
+            section, field.extent, light, small, dark, scale, pointed_at=clicked is not None
+        )
         if confidence < self.parameters.minimum_confidence:
             raise NoPointsError(
                 EdgeStatus.NO_GAP,
