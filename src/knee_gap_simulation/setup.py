@@ -22,6 +22,7 @@ setup(
             "contact_sheet = knee_gap_simulation.entry_points:contact_sheet",
             "make_bag = knee_gap_simulation.entry_points:make_bag",
             "natnet_server = knee_gap_simulation.entry_points:natnet_server",
+            "render_examples = knee_gap_simulation.entry_points:render_examples",
         ],
     },
 )

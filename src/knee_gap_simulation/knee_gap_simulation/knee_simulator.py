@@ -21,7 +21,7 @@ from 3-8 mm, the depth from 8-15 mm. ``bench.lens`` is the lens (an equidistant 
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -156,13 +156,15 @@ class KneeSimulator:
         portal: float | None = None,
         appearance: str = Appearance.PLAIN,
         anatomy: Anatomy | None = None,
+        reduction: float = 1.0,
     ) -> None:
         """Lengths [m]. ``difficulty`` sets single levels by name; the result is the same for any ``workers``.
 
         The knee is filled with ``medium``; ``bench.lens`` is the lens in it, ``Lens()`` the lens in
         ``calibrated_in`` (the same by default). ``portal``: distance from the tip back to the pivot of the
         scope, as in `HandMotion`. ``appearance`` "real" draws the look from the seed.
-        ``anatomy`` is a knee of meshes instead of a drawn one.
+        ``anatomy`` is a knee of meshes instead of a drawn one. ``reduction``: the picture has this many times
+        fewer rows and columns, and shows the same.
 
         Raises SimulationError for levels, directions and lengths that are not possible, and for a travel
         that does not fit into the joint.
@@ -187,6 +189,9 @@ class KneeSimulator:
         if Appearance(appearance) is Appearance.REAL:
             self.look = Look.drawn(seed, self.conditions)
             drawn_gap, lens = self.look.gap, self.look.lens
+        if reduction != 1.0:
+            lens = lens.reduced(reduction)
+            self.look = None if self.look is None else replace(self.look, lens=lens)
         self.settings = SimulatorSettings(
             difficulty=levels,
             seed=seed,

@@ -3,7 +3,7 @@
 It is independent of the perception's camera models, so that a mistake in those shows against the truth.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,6 +80,19 @@ class Lens:
         inside = (self.radius_px - np.hypot(offset[..., 0], offset[..., 1])) / softness_px
         inside[self._cut(np.arange(self.height_px, dtype=float))] = 0.0
         return np.clip(inside, 0.0, 1.0).astype(np.float32)
+
+    def reduced(self, factor: float) -> "Lens":
+        """The lens on a sensor with this many times fewer rows and columns, of the same field."""
+        return replace(
+            self,
+            width_px=round(self.width_px / factor),
+            height_px=round(self.height_px / factor),
+            focal_px=self.focal_px / factor,
+            centre_x_px=(self.centre_x_px + 0.5) / factor - 0.5,
+            centre_y_px=(self.centre_y_px + 0.5) / factor - 0.5,
+            cut_top_px=self.cut_top_px / factor,
+            cut_bottom_px=self.cut_bottom_px / factor,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The lens as plain values for JSON; cuts only if there are any."""
