@@ -23,7 +23,8 @@ from tqdm import tqdm
 
 from knee_gap_core.values.arrays import Image
 from knee_gap_core.values.edges import EdgeStatus
-from knee_gap_perception.camera.models import Camera, FisheyeCamera
+from knee_gap_perception.camera.camera import Camera
+from knee_gap_perception.camera.models import FisheyeCamera
 from knee_gap_perception.edge_tracking.edge_tracker import GapEdgeTracker
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import FROM_SEED, KneeSimulator, SimulatorFrame
@@ -140,7 +141,7 @@ def judged(frame: SimulatorFrame, camera: Camera, gains: tuple[float, float, flo
 
 def tinted(image: Image, gains: tuple[float, float, float]) -> Image:
     """An image (h, w, 3) with its channels multiplied and clipped."""
-    return np.asarray(cv2.convertScaleAbs(cv2.multiply(image, (*gains, 1.0))), np.uint8)
+    return np.rint(image * np.array(gains)).clip(0, 255).astype(np.uint8)
 
 
 def table(verdicts: dict[str, dict[bool, list[Verdict]]]) -> str:

@@ -34,7 +34,7 @@ from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_replay.report.comparison import EDGES, Comparison
 from knee_gap_simulation.errors import SimulationError
 from knee_gap_simulation.knee_simulator import Anatomy, KneeSimulator
-from knee_gap_simulation.make_bag import make_knee_bag
+from knee_gap_simulation.make_bag.command import make_knee_bag
 from knee_gap_simulation.recordings.recording import LENS_POSE_TRUE
 from knee_gap_simulation.recordings.scene_truth import SceneTruth, scene_from_metadata
 
