@@ -52,6 +52,11 @@ def examine(path: Path) -> list[Message]:
     for record in found[:end_of_data]:
         if isinstance(record, MessageIndex):
             indexed += len(record.records)
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            assert record.schema_id in schemas
+            channels[record.id] = record
         if not isinstance(record, Chunk):
             continue
         inside: list[Message] = []
@@ -71,6 +76,8 @@ def examine(path: Path) -> list[Message]:
     assert times == sorted(times), "the log time runs backwards"
     assert indexed == len(messages)
     summary = found[end_of_data:]
+    assert {one.id for one in summary if isinstance(one, Schema)} == set(schemas)
+    assert {one.id for one in summary if isinstance(one, Channel)} == set(channels)
     indexes = [record for record in summary if isinstance(record, ChunkIndex)]
     assert len(indexes) == sum(isinstance(record, Chunk) for record in found)
     (statistics,) = (record for record in summary if isinstance(record, Statistics))

@@ -59,6 +59,22 @@ def test_messages_out_of_order_are_logged_in_order_and_keep_their_times(tmp_path
     assert 2_000 * MS < moved[0].log_time < 3_300 * MS
 
 
+@pytest.mark.parametrize("count", [0, 3])
+def test_topics_announced_after_the_last_message_are_in_the_file(count: int, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/number", TYPE)
+        for index in range(count):
+            bag.write_raw("/number", data(index), index * MS)
+        bag.flush()
+        bag.add_topic("/late", "geometry_msgs/msg/PoseStamped", "latched")
+        bag.flush()
+    assert len(mcap_doctor.examine(tmp_path / "bag" / "bag_0.mcap")) == count
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.topics == {"/number": TYPE, "/late": "geometry_msgs/msg/PoseStamped"}
+        assert len(list(reader.messages())) == count
+        assert not reader.losses
+
+
 def test_messages_of_one_time_keep_their_order(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", [7 * MS] * 50)
     with BagReader(bag) as reader:

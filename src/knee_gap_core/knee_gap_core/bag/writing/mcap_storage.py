@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from knee_gap_core.bag.writing.pending_file import PendingFile
@@ -56,6 +58,8 @@ class McapStorage:
         self._channels: dict[str, int] = {}
         self._chunk_bytes = self._definition_bytes = 0
         self._chunk_start_ns: int | None = None
+        # Definitions of the chunk begun, which is written once it holds a message.
+        self._definitions: list[Schema | Channel] = []
 
     @property
     def message_count(self) -> int:
@@ -82,13 +86,14 @@ class McapStorage:
             self._schemas[topic.msgtype] = self._writer.register_schema(
                 topic.msgtype, topic.encoding, topic.definition
             )
+            number = self._schemas[topic.msgtype]
+            self._definitions.append(Schema(number, topic.definition, topic.encoding, topic.msgtype))
             self._chunk_bytes += len(topic.definition) + _MESSAGE_HEAD_BYTES
-        self._channels[topic.name] = self._writer.register_channel(
-            topic.name,
-            topic.serialization,
-            self._schemas[topic.msgtype],
-            {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash},
-        )
+        schema = self._schemas[topic.msgtype]
+        metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
+        number = self._writer.register_channel(topic.name, topic.serialization, schema, metadata)
+        self._channels[topic.name] = number
+        self._definitions.append(Channel(number, topic.name, topic.serialization, metadata, schema))
         self._chunk_bytes += len(topic.qos) + len(topic.name) + _MESSAGE_HEAD_BYTES
         self.counts[topic.name] = 0
 
@@ -114,6 +119,8 @@ class McapStorage:
 
     def flush(self) -> None:
         """End the chunk begun and hand it to the operating system."""
+        if self._chunk_start_ns is not None:
+            self._definitions.clear()
         self._chunk_bytes, self._chunk_start_ns = 0, None
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves it so
 
@@ -121,11 +128,19 @@ class McapStorage:
         """Write rosbag2's metadata, the index and the end. Raises OSError where they do not fit."""
         try:
             self.flush()
+            self._write_definitions()
             self._writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": metadata})
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it so
             self._file.flush()
         finally:
             self._file.close()
+
+    def _write_definitions(self) -> None:
+        """Write what was announced after the last message, since the index names it and no chunk holds it."""
+        builder = RecordBuilder()
+        for record in self._definitions:
+            record.write(builder)
+        self._file.write(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves it so
 
     def _add(self, topic: str, log_ns: int, publish_ns: int, data: bytes, length: int) -> None:
         if self._chunk_start_ns is None:
