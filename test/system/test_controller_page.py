@@ -1,4 +1,4 @@
-"""The subscriber that docs/controller.md prints, as a process: it passes what fits, and holds on all else."""
+"""The subscribers that docs/controller.md prints, as processes: they pass what fits, and hold on all else."""
 
 import os
 import re
@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from live import Client
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
@@ -22,6 +23,16 @@ from knee_gap_msgs.msg import GapEstimate
 DOMAIN = 143
 PAGE = Path(__file__).parents[2] / "docs" / "controller.md"
 GAP_QOS = QoSProfile(depth=64, deadline=Duration(nanoseconds=100_000_000))
+
+CMAKE = """
+cmake_minimum_required(VERSION 3.16)
+project(my_leg)
+find_package(rclcpp REQUIRED)
+find_package(knee_gap_msgs REQUIRED)
+add_executable(my_leg my_leg.cpp)
+target_compile_features(my_leg PRIVATE cxx_std_17)
+target_link_libraries(my_leg rclcpp::rclcpp ${knee_gap_msgs_TARGETS})
+"""
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -65,12 +76,39 @@ class Subscriber:
         return [line for line in self.lines if line != "hold: silence"]
 
 
-@pytest.fixture(scope="module")
-def subscriber(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subscriber]:
+def written_in_python(folder: Path) -> list[str]:
+    """The command of the subscriber that the page prints in Python."""
+    program = folder / "my_leg.py"
+    program.write_text(printed("python"))
+    return [sys.executable, str(program)]
+
+
+def written_in_cpp(folder: Path) -> list[str]:
+    """The command of the subscriber that the page prints in C++; skips where it cannot be built."""
+    try:
+        get_package_prefix("rclcpp")
+    except PackageNotFoundError:
+        pytest.skip("rclcpp is not installed: the subscriber in C++ is not built")
+    (folder / "my_leg.cpp").write_text(printed("cpp"))
+    (folder / "CMakeLists.txt").write_text(CMAKE)
+    for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"]):
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return [str(folder / "build" / "my_leg")]
+
+
+def printed(language: str) -> str:
+    """The one program in a language on the page."""
+    (text,) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    return str(text)
+
+
+@pytest.fixture(scope="module", params=[written_in_python, written_in_cpp], ids=["python", "c++"])
+def subscriber(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Subscriber]:
     folder = tmp_path_factory.mktemp("page")
-    (text,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    program, said = folder / "my_leg.py", folder / "said"
-    program.write_text(text)
+    command, said = request.param(folder), folder / "said"
     environment = {
         **os.environ,
         "ROS_DOMAIN_ID": str(DOMAIN),
@@ -78,7 +116,7 @@ def subscriber(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subscriber]
     }
     with (
         said.open("w") as output,
-        subprocess.Popen([sys.executable, str(program)], stdout=output, env=environment) as process,
+        subprocess.Popen(command, stdout=output, env=environment) as process,
     ):
         try:
             with Client(DOMAIN) as client:
