@@ -1,4 +1,4 @@
-"""What is VALID, and wrong, when the tracked body, the clocks or the scope are not what they are taken for.
+"""Wrong VALID estimates when the tracked body, the clocks or the scope are not what they are taken for.
 
     tools/env python bench/bench_faults.py bags/sample
 

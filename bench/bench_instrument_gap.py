@@ -1,4 +1,4 @@
-"""What an instrument meets in simulated knees, beside what else could be measured there.
+"""The instrument gap of simulated knees, beside other quantities that could be measured there.
 
 Truth only: nothing is rendered. Each knee is seen from the middle of its hand's travel, at the section
 through the middle of the gap. The first table holds what the lines of sight give, the nearest distance and

@@ -1,4 +1,4 @@
-"""What a calibration in air does to a gap in saline, without and with the conversion of its angles.
+"""Error of a gap in saline by a calibration in air, without and with the conversion of its angles.
 
     tools/env python bench/bench_medium.py --scenes 400 --tracks 2
 

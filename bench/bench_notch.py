@@ -1,4 +1,4 @@
-"""What following the notch costs an image, and how well it measures the turn of the scope.
+"""Cost of following the notch in an image, and the error of the scope's rotation from it.
 
     tools/env python bench/bench_notch.py --first 2001 --seeds 4
 

@@ -1,4 +1,4 @@
-"""Whether an instrument that does not fit is ever passed: knees whose true gap is known, without pictures.
+"""Wrong passes of an instrument that does not fit: knees whose true gap is known, without pictures.
 
 Each run is a knee, a hand's travel, and what the nodes would be given of it: bearings of two true points of
 the anatomy and of the true edges, wrong by errors drawn from their covariances, and lens poses with a

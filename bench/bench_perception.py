@@ -1,4 +1,4 @@
-"""What an image costs segmentation_node's core, beside the floor: decoding the JPEG it came in.
+"""Cost of an image in segmentation_node's core, beside the floor: decoding the JPEG it came in.
 
 Points are followed with the tracked pose of the lens, as when the tracker runs, and by the images alone.
 """

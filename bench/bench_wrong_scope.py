@@ -1,4 +1,4 @@
-"""Whether a calibration that is wrong by as much as it states passes for a joint that moves.
+"""Confusion of a calibration, wrong by as much as it states, with a joint that moves.
 
     tools/env python bench/bench_wrong_scope.py --tracks 100
 

@@ -1,1 +1,1 @@
-"""What every package stands on: values, bags, nodes, and the compilation of kernels."""
+"""The base of every package: values, bags, nodes, and the compilation of kernels."""

@@ -1,4 +1,4 @@
-"""What the nodes would be given of a simulated knee, without pictures: edges and lens poses with errors.
+"""Simulated observations of a knee without pictures: edges and lens poses with errors.
 
 The bearings of two true points of the anatomy and of the true edges are wrong by errors drawn from their
 stated covariances, and so is the pose of the lens.

@@ -1,1 +1,1 @@
-"""How wide the instrument gap is, and how sure that is."""
+"""The width of the instrument gap, with its bounds."""

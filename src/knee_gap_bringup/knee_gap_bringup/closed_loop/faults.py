@@ -1,4 +1,4 @@
-"""What goes wrong in a closed loop, and when: a seeded schedule of faults."""
+"""A seeded schedule of faults in a closed loop."""
 
 from enum import StrEnum
 

@@ -1,4 +1,4 @@
-"""What goes wrong with bags."""
+"""Errors of bags."""
 
 from knee_gap_core.values.errors import KneeGapError
 

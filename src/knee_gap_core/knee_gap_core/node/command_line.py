@@ -1,4 +1,4 @@
-"""What the commands of this package share: one line for a user's mistake, and an orderly end by signal."""
+"""The frame of every command: one line for a user's mistake, and an orderly end by signal."""
 
 import argparse
 import logging

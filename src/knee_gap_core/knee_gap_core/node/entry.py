@@ -1,4 +1,4 @@
-"""How every executable starts: it can be stopped, in silence, while its modules are still being imported.
+"""Start of every executable: it can be stopped, in silence, while its modules are still being imported.
 
 Importing takes seconds. A Ctrl-C meanwhile would print the traceback of whatever was being imported, or be
 taken for its failure. So an entry point imports nothing but this module, which sets the signals first.

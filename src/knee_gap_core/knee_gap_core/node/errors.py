@@ -1,4 +1,4 @@
-"""What can be wrong with how a node was started."""
+"""Errors of a node's start."""
 
 from knee_gap_core.values.errors import KneeGapError
 

@@ -1,4 +1,4 @@
-"""Whether the poses of a lens follow from each other as those of a hand do, with no unseen step between.
+"""Continuity of lens poses: test whether they follow from each other as in a hand, with no unseen step.
 
 A marker body that slips while the tracker does not see it comes back at another place with sound poses: no
 pose is wrong, but the views before and after are no longer in one frame. So poses are numbered by segments.

@@ -1,4 +1,4 @@
-"""Why a number is not given: a reason to count by, and what is particular to the case."""
+"""Rejection of an estimate: a reason to count by, and the detail of the case."""
 
 from enum import StrEnum
 from typing import NamedTuple

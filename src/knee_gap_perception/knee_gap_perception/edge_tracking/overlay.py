@@ -1,4 +1,4 @@
-"""What was found, drawn over the image for people to look at."""
+"""Overlay of the gap, its points and its edges on the image, for people to look at."""
 
 import cv2
 import numpy as np

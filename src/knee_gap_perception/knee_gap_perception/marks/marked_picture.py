@@ -1,4 +1,4 @@
-"""What is marked in one picture: field of view, gap, instruments, glare, and whether it shows a gap."""
+"""The marks of one picture: field of view, gap, instruments, glare, and whether it shows a gap."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Where on the tissue beside an edge a point is best followed."""
+"""Selection of the point on the tissue beside an edge that is best followed."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""How much texture the places of a piece of tissue have, to follow a point by."""
+"""Texture at the places of a piece of tissue, by which a point can be followed."""
 
 import numpy as np
 

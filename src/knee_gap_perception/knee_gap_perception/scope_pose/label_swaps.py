@@ -1,4 +1,4 @@
-"""Whether the tracker has exchanged the labels of bodies."""
+"""Detection of bodies whose labels the tracker has exchanged."""
 
 from collections.abc import Iterable
 

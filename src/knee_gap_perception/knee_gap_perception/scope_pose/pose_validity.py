@@ -1,4 +1,4 @@
-"""Whether a tracked pose may be believed: what trackers and their drivers send that is no measurement."""
+"""Outlier rejection for tracked poses: drop-outs, jumps, frozen drivers and impossible numbers."""
 
 from collections import Counter, deque
 from collections.abc import Iterable

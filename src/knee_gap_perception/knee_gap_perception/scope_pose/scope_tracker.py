@@ -1,4 +1,4 @@
-"""Where the lens is: a tracked body, and the scope fixed to it, to the pose of the lens with its error."""
+"""Conversion of a tracked body to the pose of the lens that is fixed to it, with its error."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields

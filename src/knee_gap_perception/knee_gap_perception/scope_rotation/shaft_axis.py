@@ -1,4 +1,4 @@
-"""How the lens of an oblique scope moves when the scope is turned in its camera head.
+"""Motion of the lens of an oblique scope that is turned in its camera head.
 
 The relay of lenses carries the picture of the tip to the sensor, so a turn of the scope by an angle turns the
 picture, notch and all, by the same angle (clockwise on the screen where the scope turns clockwise as seen

@@ -1,4 +1,4 @@
-"""What is left of a damaged bag, copied into a sound one."""
+"""Recovery of a damaged bag: its complete messages, copied into a sound one."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What the camera and the ground truth ask of the scene of a knee, whatever it is made of."""
+"""Interface of a knee's scene for the camera and the ground truth, of formulas or of meshes."""
 
 from typing import Any, Protocol
 

@@ -1,1 +1,1 @@
-"""How a simulated knee looks: drawn from what arthroscopes show, instead of the plain renders."""
+"""Looks of a simulated knee: drawn from what arthroscopes show, instead of the plain renders."""

@@ -1,4 +1,4 @@
-"""What a look changes in the camera of a scene."""
+"""Changes by a look in the camera of a scene."""
 
 import numpy as np
 import numpy.typing as npt

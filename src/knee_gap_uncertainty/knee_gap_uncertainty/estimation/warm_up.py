@@ -1,4 +1,4 @@
-"""Everything compiled that a live estimate runs, compiled or loaded from disk before the first image.
+"""Warm-up of the estimate: all compiled code is compiled or loaded from disk before the first image.
 
 The kernels are compiled for the kinds of arrays that reach them; so a whole short track is estimated, as it
 would be live, with advice beside it and edges that jump at its end.

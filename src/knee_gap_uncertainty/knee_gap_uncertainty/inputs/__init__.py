@@ -1,1 +1,1 @@
-"""What the estimator receives beside edges: lens poses, scope rotations, the leg body."""
+"""Inputs of the estimator beside edges: lens poses, scope rotations, the leg body."""

@@ -1,4 +1,4 @@
-"""Whether the two points stand still, as the analysis assumes: tested on the residuals of every image.
+"""Test whether the two points stand still, as the analysis assumes, on the residuals of every image.
 
 `motion_statistics` measures how far the residuals are from those of points at rest; here that is judged,
 image by image.

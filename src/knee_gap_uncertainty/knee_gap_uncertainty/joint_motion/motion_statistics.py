@@ -1,4 +1,4 @@
-"""How far the residuals of a track are from those of two points that stand still.
+"""Statistics of a track's residuals, compared with those of two points that stand still.
 
 Four statistics, chi-square with 2 degrees of freedom, the last with 3, where nothing moved. `present`: how
 far a bearing of the present view lies from where the earlier views put it; `first`: the same of the view that

@@ -1,4 +1,4 @@
-"""How far the scope should move, and where to, so that the gap is known as well as asked for.
+"""Advice on motion: how far and where to the scope should move for the wanted certainty of the gap.
 
 The signal-to-noise ratio is not monotone in the travel, so nothing is bisected over the whole range: travel
 is scanned in steps from the present lens position, the rays to the present estimate of the points are

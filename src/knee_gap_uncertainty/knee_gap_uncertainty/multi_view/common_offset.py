@@ -1,4 +1,4 @@
-"""What a large common offset does to the gap beyond first order.
+"""The effect of a large common offset on the gap, beyond first order.
 
 The offset that all bearings of a point share is carried from the optical axis to each bearing, so that far
 off the axis it is another turn in every view. What the fit makes of it is then not proportional to it. The

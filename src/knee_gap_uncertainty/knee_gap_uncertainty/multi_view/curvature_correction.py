@@ -1,4 +1,4 @@
-"""How far an accepted estimate strays from a curved surface that holds the truth, compiled.
+"""Distance of an accepted estimate from a curved surface that holds the truth, compiled.
 
 An interval of the distance between two points holds a value d0 while the estimate lies within a radius k, in
 standard deviations, of the surface on which the distance is d0. For a plane the chance to be farther is that

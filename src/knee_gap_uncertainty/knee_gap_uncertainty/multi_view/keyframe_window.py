@@ -1,4 +1,4 @@
-"""Which views of a track are kept for the fit, so that it stays bounded in size and does not drift."""
+"""The views of a track that are kept for the fit, so that it stays bounded in size and does not drift."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What an image error that grows with the parallax does to a gap: the point drifts along its first ray.
+"""Scale drift: an image error that grows with the parallax, by which a point drifts along its first ray.
 
 Light that moves with the scope, relief that is taken for a plane and a contour that slides let a followed
 point lag behind its parallax, or run ahead of it, by a share that stays much the same over a track. Bearings

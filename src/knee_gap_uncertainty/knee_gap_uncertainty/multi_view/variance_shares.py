@@ -1,4 +1,4 @@
-"""What makes the error: the covariance that all causes give the points together, and each one's share.
+"""Shares of the variance: the covariance of the points by all causes together, and each one's share.
 
 The bearings' common part, one offset of each point for the whole track, is not estimated but considered: an
 estimate that relied on the offset being the same everywhere would gain where the parallax is large, and be

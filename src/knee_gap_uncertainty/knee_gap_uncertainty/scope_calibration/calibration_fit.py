@@ -1,4 +1,4 @@
-"""How much of a track's residuals the calibration's error explains: what it does is no motion of a joint.
+"""The part of a track's residuals that the calibration's error explains, and that is not joint motion.
 
 The error is the same in all views, so it leaves a pattern in them: a lens that sits elsewhere on its body
 shows as points that move when the scope turns. Points and error are fitted together, the error held to what

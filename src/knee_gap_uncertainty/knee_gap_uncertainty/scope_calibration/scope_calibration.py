@@ -1,4 +1,4 @@
-"""What the calibration of the scope does to a gap: an error that all views of a track share.
+"""Error of the gap by the calibration of the scope, which all views of a track share.
 
 A shift of the lens on its body is felt only where the scope turns between the views, be it in its camera head
 (the picture then turns against the lens, and the error with it), a turn of it turns every bearing against the

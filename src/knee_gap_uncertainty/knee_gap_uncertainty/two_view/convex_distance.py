@@ -1,4 +1,4 @@
-"""Whether two clouds overlap: how near their convex hulls come.
+"""Distance of two clouds' convex hulls, 0 if they overlap.
 
 The clouds are samples of volumes that are very nearly convex (the frustum of a cone, blurred by the displaced
 lens), so where hulls meet, the two points of the gap may be one, and the smallest distance between samples

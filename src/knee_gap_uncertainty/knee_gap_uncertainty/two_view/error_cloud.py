@@ -1,4 +1,4 @@
-"""Where a point of the gap may be, given all admitted errors: equations (21)-(25), from either lens.
+"""Error cloud of a point of the gap, under all admitted errors: equations (21)-(25), from either lens.
 
 A cloud is seen from the ray's own lens, its apex, which is at the origin: the clouds of b_n have A0 as apex
 and the travel t, those of a_n have A1 and -t. Everything below is written for the one and serves for the

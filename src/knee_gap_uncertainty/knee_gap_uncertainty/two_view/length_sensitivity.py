@@ -1,4 +1,4 @@
-"""How the length of a ray answers to errors: exactly (8), linearised (11), and against the truth (12).
+"""Sensitivity of the length of a ray to errors: exactly (8), linearised (11), and against the truth (12).
 
 L is the length of the ray from one lens: |t| sin(other angle) / sin(own angle + other angle). The paper's
 (7)-(11) write sin alpha for |b|; by (2) it is sin beta, the angle at the other lens, and that is what stands

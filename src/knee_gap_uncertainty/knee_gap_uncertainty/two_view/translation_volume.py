@@ -1,4 +1,4 @@
-"""Where a lens may be, given the error of its tracked position: equations (13)-(16)."""
+"""Places of a lens under the error of its tracked position: equations (13)-(16)."""
 
 import math
 

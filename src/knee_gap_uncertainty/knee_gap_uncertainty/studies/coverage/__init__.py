@@ -1,1 +1,1 @@
-"""How often the published intervals hold the truth: a study on simulated tracks, run by one command."""
+"""Coverage of the published intervals: a study on simulated tracks, run by one command."""

@@ -1,4 +1,4 @@
-"""What is measured in a cell: simulate its tracks, run the estimator on them, and count."""
+"""Measurement of a cell: simulate its tracks, run the estimator on them, and count."""
 
 from collections.abc import Iterator
 from dataclasses import replace

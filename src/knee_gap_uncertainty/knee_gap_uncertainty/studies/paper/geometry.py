@@ -1,4 +1,4 @@
-"""Where the gap lies from the scope: the paper does not say, so it is a parameter.
+"""Place of the gap relative to the scope: a parameter, because the paper does not give it.
 
 As printed, the lens ends at the origin after a travel of T from (-T sin rho, -T cos rho, 0), and rho = 0 is
 perpendicular to the gap's projection onto the x-y plane: that projection lies along x. Left open are the

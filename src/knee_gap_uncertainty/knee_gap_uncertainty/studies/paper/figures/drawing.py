@@ -1,4 +1,4 @@
-"""How all figures of the study look: colours, sizes, and the plane in which a measurement is seen."""
+"""Common style of the study's figures: colours, sizes, and the plane in which a measurement is seen."""
 
 from dataclasses import dataclass
 from pathlib import Path
