@@ -1,6 +1,6 @@
 """A bag played to the three nodes: `ros2 launch knee_gap_bringup replay.launch.py bag:=bags/sample`.
 
-It ends with the bag. The exit code is not 0 if there is no bag, if `out` exists, or if a process fails.
+It ends with the bag. The exit code is not 0 if there is not a bag, if `out` exists, or if a process fails.
 """
 
 from pathlib import Path

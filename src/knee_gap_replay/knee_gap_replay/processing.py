@@ -20,7 +20,7 @@ _LOG = logging.getLogger(__name__)
 
 # Largest latency of a driver [ns]: within it, messages are sorted by their stamps.
 MOST_LATENCY_NS = 500_000_000
-# Stamps of two topics at least this far apart are of different clocks [ns]: one counts since boot, say.
+# Stamps of two topics at least this far apart are of different clocks [ns]: one may count since boot.
 _OTHER_CLOCK_NS = 3_600 * 1_000_000_000
 # Messages needed to determine a topic's clock, and the length of the part of the bag that is searched [ns].
 _ENOUGH_MESSAGES = 20

@@ -58,7 +58,7 @@ def edges_seen(
 def points_beside(scene: Scene, T_scene_lens: Array, edges: Array) -> Array:
     """Surface points (2, 3) of the scene, `INSET` beside two edges (2, 3) of the lens.
 
-    Raises SimulationError if there is no tissue.
+    Raises SimulationError if there is not tissue.
     """
     view, across = edges.sum(axis=0), edges[1] - edges[0]
     view, across = view / np.linalg.norm(view), across / np.linalg.norm(across)

@@ -55,9 +55,8 @@ class EstimatorParameters:
     scale_drift: float = field(
         default=0.002,
         metadata={
-            "description": "standard deviation of the share of its parallax by which the image carries a "
-            "point too far or not far enough, the same over a track, beyond what the bearings' covariances "
-            "tell [-]",
+            "description": "standard deviation of a point's scale drift: the fraction of its parallax by "
+            "which tracking over- or undershoots, constant over a track, beyond the covariances [-]",
             "range": (0.0, 0.1),
         },
     )

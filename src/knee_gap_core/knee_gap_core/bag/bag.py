@@ -57,8 +57,8 @@ class BagReader:
 
     `topics` maps names to types, `details` to types, quality of service and definitions, `metadata` is the
     bag's own (custom data). Topics and types recorded under former names appear under those of today, and
-    `renamed` says so in one line. What is damaged is left out and named, one line each, in the log and in
-    `losses`. Raises BagError where there is no bag, or not one that can be read.
+    `renamed` reports it in one line. What is damaged is left out and named, one line each, in the log and in
+    `losses`. Raises BagError where there is not a bag, or not one that can be read.
     To `salvage` is to keep all names as recorded, and to read what is complete in a chunk that is cut, too.
     """
 

@@ -1,4 +1,4 @@
-"""The reason why there is no bag at a path, in the same words for every command."""
+"""The reason why there is not a bag at a path, in the same words for every command."""
 
 import os
 import stat

@@ -66,7 +66,7 @@ def typestore() -> Typestore:
 def known_type(msgtype: str) -> str:
     """Return `msgtype` as `package/msg/Name`, loading its definition into `typestore()` if need be.
 
-    Raises BagError for a name that is no message type or whose definition is not found.
+    Raises BagError for a name that is not a message type or whose definition is not found.
     """
     name = full_name(msgtype)
     if name.count("/") != 2:

@@ -107,7 +107,7 @@ class NodeCore(Protocol):
         """The end of a recording: yield what still waits for messages."""
 
     def recover(self, fault: Fault) -> Sequence[Outcome]:
-        """Start afresh after an exception; return what is published for the message that raised it."""
+        """Reset after an exception; return what is published for the message that raised it."""
 
     def health(self) -> Health:
         """Return the present health."""

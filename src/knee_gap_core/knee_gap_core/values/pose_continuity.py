@@ -26,7 +26,7 @@ TOLERANCE = 0.2e-3  # [m] beyond the poses' own errors
 ANGULAR_TOLERANCE = 2.0e-3  # [rad]
 MOST_UNKNOWN = 1.0e-3  # [m] by which acceleration may explain a deviation, however long the gap
 MOST_UNKNOWN_ANGLE = 2.0e-2  # [rad]
-SIGMAS = 4.0  # standard errors of a deviation that are no step
+SIGMAS = 4.0  # standard errors of a deviation that are not steps
 MOTION_TIME_NS = 15_000_000  # over which the velocity before a gap is taken
 # A pose that is lost costs two: the one after a gap of more than two periods is refused as well.
 GAP_PERIODS = 4.25  # of the tracker, the longest gap over which its motion is extrapolated
@@ -112,7 +112,7 @@ class PoseContinuity:
         return "" if self._follows(last, pose) else "the lens pose made a step that no hand makes"
 
     def _longest_gap_ns(self) -> float:
-        """Longest time between two poses that is no occlusion [ns]."""
+        """Longest time between two poses that is not an occlusion [ns]."""
         usual = median(self._intervals_ns) if self._intervals_ns else 0.0
         latest = self._latest_ns
         if len(latest) == ALIKE and 0 < max(latest) <= min(ALIKE_RATIO * min(latest), SLOWEST_PERIOD_NS):

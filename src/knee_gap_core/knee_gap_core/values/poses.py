@@ -10,7 +10,7 @@ import numpy.typing as npt
 from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.quaternions import matrix, unit_quaternion
 
-# No tracker sees farther [m]; what lies beyond is no place, and its square may be no number.
+# No tracker sees farther [m]; what lies beyond is not a place, and its square may not be a number.
 FARTHEST = 1000.0
 UNIT_TOLERANCE = 1e-3  # [-] by which a quaternion's length may differ from 1
 

@@ -33,7 +33,7 @@ POSE_TYPES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovari
 class CalibrationBag:
     """A recorded bag, and the part of it [s from its start] to be read.
 
-    Raises PerceptionError if there is no bag or it cannot be read.
+    Raises PerceptionError if there is not a bag or it cannot be read.
     """
 
     path: Path

@@ -19,8 +19,8 @@ LEAST_CONTRAST = 0.05  # [-] limit: lower values carry no further information
 MOST_UNEVEN = 0.45  # [-] limit: bone lit in the depth of a gap makes it more uneven than shade
 WIDE = 0.1  # [-] radius of the disc relative to the field's; upper limit
 NARROWEST = 0.03  # [-] the same; lower limit
-# Distance dims all colours alike; a change of tissue does not. Of a part that is almost black, colour says
-# nothing.
+# Distance dims all colours alike; a change of tissue does not. The colour of a part
+# that is almost black means nothing.
 PIGMENT_WEIGHT = -120.0
 SAME_COLOUR = 0.2  # [-] difference of the channels' log ratios that reflections between tissues explain
 LIT_GAP = (0.3, 0.45)  # [-] brightness relative to a side from which colour begins to count, counts in full

@@ -100,7 +100,7 @@ def find_section(
             if section is not None and (beside is None or _is_apart(section, beside, scale)):
                 best = (float(score[row, column]), section)
                 break
-            # There is no tissue on one side here, or an instrument: search elsewhere along the same part.
+            # There is not tissue on one side here, or an instrument: search elsewhere along the same part.
             radius = max(6.0, float(distance[row, column]))
             away2 = (columns[:, box[1]] - x - column) ** 2 + (rows[box[0]] - y - row) ** 2
             score = np.where(away2 < radius**2, 0.0, score)
@@ -121,7 +121,7 @@ def _section_through(
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     length = np.arange(0.0, 4.0 * radius + 20.0, STEP)
     reach = np.empty((DIRECTIONS, 2))
-    # Rays that leave the frame end in a padding that is no gap.
+    # Rays that leave the frame end in a padding that is not a gap.
     padding = int(length[-1]) + 2
     padded = cv2.copyMakeBorder(
         part.astype(np.uint8), padding, padding, padding, padding, cv2.BORDER_CONSTANT

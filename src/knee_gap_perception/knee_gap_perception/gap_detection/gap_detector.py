@@ -39,7 +39,7 @@ class NoPointsError(Exception):
 
 
 class Found(NamedTuple):
-    """A section, and what is no tissue in the image reduced by `scale`.
+    """A section, and what is not tissue in the image reduced by `scale`.
 
     `foreign` (h, w) are instruments and glare, `instruments` (h, w) those alone.
     """

@@ -164,7 +164,7 @@ def _edge_points(small: Brightness) -> Array:
 
 
 def _is_filled(apart: Brightness, circle: Circle) -> bool:
-    """Whether most of a circle differs from the surround: it is no ring on tissue."""
+    """Whether most of a circle differs from the surround: it is not a ring on tissue."""
     rows, columns = np.ogrid[: apart.shape[0], : apart.shape[1]]
     inside = np.hypot(columns - circle.x, rows - circle.y) < circle.radius
     return bool((apart[inside] > APART).mean() > FILLED)

@@ -79,7 +79,7 @@ def _edges(value: Image, centre: Array, radius: float) -> list[_Edge]:
     ends = segments.reshape(-1, 2, 2) + first
     steps = ends[:, 1] - ends[:, 0]
     length = np.hypot(steps[:, 0], steps[:, 1])
-    # The rim itself is no edge.
+    # The rim itself is not an edge.
     away = np.hypot(*(ends.mean(axis=1) - centre).T)
     kept = (length > SHORTEST_PIECE * radius) & (away < RIM * radius)
     ends, length, along = ends[kept], length[kept], steps[kept] / length[kept, None]

@@ -74,7 +74,7 @@ def choose_points(
     Near the section, and a little nearer to or farther from the edge, the place with the strongest texture
     and without highlight is taken: the texture is what the point is followed by. Places near the rim of the
     field soon leave it: they are taken only where there are no others. `foreign` (h, w) is where
-    the picture, made smaller by `scale`, shows what is no tissue, and `instruments` (h, w) the part of it
+    the picture, made smaller by `scale`, shows what is not tissue, and `instruments` (h, w) the part of it
     that is not glare (all of it if not given); no place beside them is taken.
     """
     near = _grown(foreign if instruments is None else instruments, AWAY) | _grown(foreign, AWAY_FROM_GLARE)
@@ -127,7 +127,7 @@ def _grown(mask: Mask, margin: int) -> Mask:
 
 
 def _is_clear(pixel: Array, near: Mask, scale: float) -> bool:
-    """Whether a pixel (2,) lies apart from what is no tissue: a probe has more texture than any tissue."""
+    """Whether a pixel (2,) lies apart from what is not tissue: a probe has more texture than any tissue."""
     column, row = np.rint(scale * pixel).astype(int)
     return not near[min(row, near.shape[0] - 1), min(column, near.shape[1] - 1)]
 

@@ -102,7 +102,7 @@ class TangentPlane:
         """Take registered parameters (6,) and their covariance (6, 6), whose prior was the prediction.
 
         Registrations of one patch are wrong in the same way: by the light that moved, by relief that is no
-        plane. They are no independent observations, however many images there are. So the plane forgets as
+        plane. They are not independent observations, however many images there are. So the plane forgets as
         the lens travels, and takes in as much as it forgets: it knows what one registration from here
         measures.
         """

@@ -28,7 +28,7 @@ class TissueTexture:
     def __init__(self, grey: Image, centre: Array, reach: float, half_size: int, dark_below: float) -> None:
         """Take what is within `reach` [px] of a pixel (2,) of an image (h, w), for patches of a half size.
 
-        Grey levels below `dark_below` are no tissue.
+        Grey levels below `dark_below` are not tissue.
         """
         surface = surface_around(grey, centre, int(np.ceil(reach)) + half_size + MARGIN, dark_below)
         self._dx, self._dy = gradients(surface.texture)

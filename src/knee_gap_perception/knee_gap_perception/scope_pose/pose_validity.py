@@ -51,7 +51,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class ValidityParameters:
-    """Limits beyond which a tracked pose is no measurement of a scope in a hand.
+    """Limits beyond which a tracked pose is not a measurement of a scope in a hand.
 
     Raises PerceptionError for a limit outside its range.
     """
@@ -74,12 +74,15 @@ class ValidityParameters:
     )
     max_speed: float = field(
         default=1.0,
-        metadata={"description": "Fastest motion of the body that is no jump [m/s]", "range": (0.001, 100.0)},
+        metadata={
+            "description": "Fastest motion of the body without a jump [m/s]",
+            "range": (0.001, 100.0),
+        },
     )
     max_angular_speed: float = field(
         default=15.0,
         metadata={
-            "description": "Fastest rotation of the body that is no jump [rad/s]",
+            "description": "Fastest rotation of the body without a jump [rad/s]",
             "range": (0.01, 1000.0),
         },
     )
@@ -203,7 +206,7 @@ class PoseValidity:
     def _swapped_with(self, body: BodyPose, others: tuple[BodyPose, ...]) -> str | None:
         other = self._swapped.update((body, *others)).get(body.name)
         if other is None:
-            # Not seen is no return: the time of a swap goes on until the label is back on its body.
+            # Not seen is not a return: the time of a swap goes on until the label is back on its body.
             if body.tracking_valid:
                 self._swap_stamp_ns = None
             return None

@@ -25,7 +25,7 @@ SMOOTH = 27  # directions (20 degrees) over which the brightness inside is level
 DARK = 22.0  # [grey levels] above black, below which a direction shows no tissue: the gap, or nothing
 DARK_SAMPLES = 1  # of a direction that is lit all the way
 CIRCLE_PASSES = 3
-OFF_CIRCLE = 0.012  # of the radius, beyond which a direction is no part of the circle
+OFF_CIRCLE = 0.012  # of the radius, beyond which a direction is not a part of the circle
 FEWEST_ON_CIRCLE = 0.35  # of all directions
 
 _ANGLES = np.arange(STEPS) * STEP

@@ -95,7 +95,7 @@ class PoseBuffer:
         """Keep a pose, or return why not.
 
         A stamp before the newest one (a bag that starts again) or another frame empties the buffer first. A
-        pose that goes on repeating the one before it to the last bit is no measurement, whatever its stamp.
+        pose that repeats the one before it to the last bit is not a measurement, whatever its stamp.
         """
         if refusal := _refusal(pose):
             return refusal
@@ -141,7 +141,7 @@ class PoseBuffer:
     def _before(self, index: int) -> LensPose:
         """The earliest pose within MOTION_TIME before that of an index, at least the one before it.
 
-        Of the same segment: a step is no velocity.
+        Of the same segment: a step is not a velocity.
         """
         start, segment = self._poses[index].stamp_ns - MOTION_TIME_NS, self._poses[index].segment
         found = min(bisect_left(self._poses, start, key=lambda pose: pose.stamp_ns), index - 1)

@@ -95,7 +95,7 @@ def motion_statistics(
     """Statistics of views, the last of which is the present one; all zero for a single view.
 
     `fitted`: a fit over most of them, None if there is none; `rates` [m/s]: RMS rate of the creep that
-    is no contradiction, and deviation per axis of the creep of a body of which nothing is known.
+    is not a contradiction, and deviation per axis of the creep of a body of which nothing is known.
     """
     count = len(observed.lens)
     if count < 2:

@@ -4,7 +4,7 @@ The offset that all bearings of a point share is carried from the optical axis t
 off the axis it is another turn in every view. What the fit makes of it is then not proportional to it. The
 fit is repeated with the offset added and taken away along four directions of the space of both points'
 offsets; the second differences of the gap, less those that the interval knows of already because a gap is no
-linear function of the unknowns either, say how far its ends move (Cornish and Fisher's expansion to the
+linear function of the unknowns either, are how far its ends move (Cornish and Fisher's expansion to the
 second order; nodes and weights as in the unscented transform, Julier and Uhlmann, Proceedings of the IEEE 92,
 2004).
 """

@@ -32,7 +32,7 @@ from knee_gap_uncertainty.numerics.small_matrix import cholesky
 # above it is 3 % of variance where no error is common, and is in the covariance.
 GATE = 10.6
 # With fewer views a bad bearing pulls the fit to itself, and neither it nor the scale of the errors can be
-# told.
+# found.
 FEWEST_VIEWS_TO_GATE = 5
 FEWEST_VIEWS_TO_SCALE = 10
 LARGEST_GATED_SHARE = 0.25
@@ -78,7 +78,7 @@ class MultiViewFit:
     the errors are as large as stated; `scale` >= 1: what the covariances were multiplied by because of
     it. `used` (N, 2) is false for gated bearings; `residuals` (N, 2): their squared length in standard
     deviations. `shares` (4,): image, lens position, lens rotation and common part of the variance of the gap;
-    they sum to 1, and are NaN where there is no gap. `bend`: how far a large common offset moves
+    they sum to 1, and are NaN where there is not a gap. `bend`: how far a large common offset moves
     the ends of the gap's interval.
     """
 
@@ -122,8 +122,8 @@ def fit(views: Views) -> MultiViewFit:
     """Fit both points to all views.
 
     Raises BadInputError for fewer than two views, and BaselineTooShortError where all lens positions are the
-    same: then no depth is in the data. A short travel is no error: the relative error of the inverse depth
-    tells it.
+    same: then no depth is in the data. A short travel is not an error: the relative error of the inverse
+    depth shows it.
     """
     if len(views) < 2:
         raise BadInputError(f"at least 2 views are needed to measure depth, not {len(views)}")

@@ -3,7 +3,7 @@
 A shift of the lens on its body is felt only where the scope turns between the views, be it in its camera head
 (the picture then turns against the lens, and the error with it), a turn of it turns every bearing against the
 travel, a clock that is off moves the lens along its way, and a camera whose numbers are off turns each
-bearing by where it lies in the picture. None of it averages out, so it is no part of the covariance of a lens
+bearing by where it lies in the picture. None of it averages out, so it is not in the covariance of a lens
 pose or a bearing: it is considered, as the common part of the image's error is. The gap's fit is taken as it
 is, and to its covariance comes what the shared error does to it. The camera's errors and those of the lens on
 its body are taken as independent, though one fit has found both and they mostly make up for each other.
@@ -29,8 +29,8 @@ from knee_gap_uncertainty.scope_calibration.shared_error_kernel import moved_poi
 
 HASH_DIGITS = 12  # of a hash, in words
 
-# Standard deviations of shift [m] and rotation [rad] of the lens and of the clock [s] above which what is
-# told is a mistake.
+# Standard deviations of shift [m] and rotation [rad] of the lens and of the clock [s] above which a
+# reported error is a mistake.
 LARGEST_LENS_ERRORS = np.repeat([0.1, 1.0], 3)
 LARGEST_CLOCK_ERROR = 1.0
 # Of a covariance that was written and read, relative to its standard deviations.

@@ -3,7 +3,7 @@
 A point lies on a ray within psi of its bearing, at a length between the shortest and the longest by (8), from
 a lens displaced by at most DT: the frustum of a cone between two spherical caps, blurred by a ball. The
 clouds draw that on rings of eight points, a quarter of which have no point at all, so a smallest distance of
-samples is no bound where the rings are wide beside the gap. Of the convex hull of the volume the farthest
+samples is not a bound where the rings are wide beside the gap. Of the convex hull of the volume the farthest
 point in any direction is known in closed form, and that is all the search for the distance needs.
 """
 

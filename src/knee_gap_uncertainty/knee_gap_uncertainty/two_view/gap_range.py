@@ -193,7 +193,7 @@ def checked_error(name: str, value: float, unit: str) -> float:
 
 
 def checked_choices(interval: str, apex: str, radii: int) -> npt.NDArray[np.float64]:
-    """Rows of signs of the interval; BadInputError for a name or number that is no choice."""
+    """Rows of signs of the interval; BadInputError for a name or number that is not a choice."""
     if interval not in INTERVAL_SIGNS:
         raise BadInputError(f"interval must be one of {', '.join(INTERVAL_SIGNS)}, got {interval!r}")
     if apex not in ("first", "second", "best"):

@@ -54,7 +54,7 @@ class BagWriter:
     at the time of the last one written, and keeps its own as time of publishing. The same calls give the same
     bytes in every file, whatever the bag's name. What was written before an exception is kept and readable.
     To `replace` a bag removes its files, and keeps what else is in its folder.
-    Raises BagError if `path` exists already, or is to be replaced and is no bag, or cannot be made.
+    Raises BagError if `path` exists already, or is to be replaced and is not a bag, or cannot be made.
     """
 
     def __init__(
