@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from bench_segmentation import GOLDEN
 from kept_frames import frames_of
@@ -141,7 +140,8 @@ def judged(frame: SimulatorFrame, camera: Camera, gains: tuple[float, float, flo
 
 def tinted(image: Image, gains: tuple[float, float, float]) -> Image:
     """An image (h, w, 3) with its channels multiplied and clipped."""
-    return np.rint(image * np.array(gains)).clip(0, 255).astype(np.uint8)
+    bright: Image = np.rint(image * np.array(gains)).clip(0, 255).astype(np.uint8)
+    return bright
 
 
 def table(verdicts: dict[str, dict[bool, list[Verdict]]]) -> str:
