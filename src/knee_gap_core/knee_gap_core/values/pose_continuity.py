@@ -87,23 +87,27 @@ class PoseContinuity:
             if frame_id == self._frame_id and interval_ns == 0:
                 return self.segment
             self._latest_ns.append(interval_ns)
-            if reason := self._break(pose, frame_id):
+            longest_ns = self._longest_gap_ns()
+            if reason := self._break(pose, frame_id, longest_ns):
                 self.segment, self.reason = self.segment + 1, reason
                 self._poses.clear()
-            elif interval_ns <= self._longest_gap_ns():
+            elif interval_ns <= longest_ns:
                 self._intervals_ns.append(interval_ns)
         self._frame_id = frame_id
         self._poses.append(pose)
         return self.segment
 
-    def _break(self, pose: _Pose, frame_id: str) -> str:
-        """Why a pose does not follow from the last, in words; empty if it does."""
+    def _break(self, pose: _Pose, frame_id: str, longest_ns: float) -> str:
+        """Why a pose does not follow from the last, in words; empty if it does.
+
+        `longest_ns`: the longest time between two poses that is no occlusion.
+        """
         last = self._poses[-1]
         if frame_id != self._frame_id:
             return "the lens poses are given in another frame"
         if pose.stamp_ns < last.stamp_ns:
             return "the stamps of the lens poses run backwards"
-        if pose.stamp_ns - last.stamp_ns > self._longest_gap_ns():
+        if pose.stamp_ns - last.stamp_ns > longest_ns:
             follows = _length(_shift(last, pose)) <= TOLERANCE + SIGMAS * sqrt(last.variance + pose.variance)
             follows = follows and _length(_turn(last, pose)) <= ANGULAR_TOLERANCE + SIGMAS * sqrt(
                 last.turn_variance + pose.turn_variance

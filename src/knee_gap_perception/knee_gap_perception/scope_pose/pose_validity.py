@@ -130,6 +130,8 @@ class PoseValidity:
         """Forget all poses, not the counts."""
         self._stamp_ns: int | None = None
         self._intervals: deque[float] = deque(maxlen=51)
+        # Their median; None if it is to be found again.
+        self._usual: float | None = None
         self._last: BodyPose | None = None
         self._before_jump: BodyPose | None = None
         self._jump_stamp_ns = 0
@@ -141,7 +143,9 @@ class PoseValidity:
         """Period of the tracker [s]; NaN until known."""
         if isfinite(self.parameters.tracker_rate):
             return 1.0 / self.parameters.tracker_rate
-        return median(self._intervals) if len(self._intervals) >= 5 else nan
+        if self._usual is None:
+            self._usual = median(self._intervals) if len(self._intervals) >= 5 else nan
+        return self._usual
 
     def check(self, body: BodyPose, others: Iterable[BodyPose] = ()) -> Refusal | None:
         """Return why `body` is not to be believed, or None; `others` are the bodies of the same frame."""
@@ -172,6 +176,7 @@ class PoseValidity:
             return RefusalReason.DUPLICATE, "the pose has the stamp of the one before it"
         if previous is not None:
             self._intervals.append((body.stamp_ns - previous) / 1e9)
+            self._usual = None
             if body.stamp_ns - previous > RETURN_TIME * 1e9:
                 # Time in which nothing came confirms neither a jump nor where the labels are.
                 self._jump_stamp_ns += body.stamp_ns - previous

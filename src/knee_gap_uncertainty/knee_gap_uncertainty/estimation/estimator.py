@@ -42,10 +42,11 @@ MOST_ADVICE = 16
 
 
 class Pending(NamedTuple):
-    """Edges that wait for the lens pose after them, and when they arrived [ns]."""
+    """Edges that wait for the lens pose after them, when they arrived [ns], and why they cannot be used."""
 
     edges: GapEdges
     arrival_ns: int
+    flaw: str = ""
 
 
 class GapEstimator:
@@ -163,7 +164,7 @@ class GapEstimator:
         if len(self._pending) == MOST_PENDING:
             self.counts["images dropped while waiting for poses"] += 1
             self._pending.popleft()
-        self._pending.append(Pending(edges, arrival_ns))
+        self._pending.append(Pending(edges, arrival_ns, edges.flaw()))
         return self._resolve(arrival_ns)
 
     def advance(self, now_ns: int, advice_pieces: int = PIECES) -> list[GapEstimate]:
@@ -262,7 +263,7 @@ class GapEstimator:
         facts = Facts(
             self.parameters,
             edges=edges,
-            edges_flaw=edges.flaw(),
+            edges_flaw=pending.flaw,
             clock_offset=1e-9 * (pending.arrival_ns - edges.stamp_ns) if self._is_live else np.nan,
             delay=self._delays.excess(pending.arrival_ns - edges.stamp_ns),
             pose=self._poses.at(edges.stamp_ns),

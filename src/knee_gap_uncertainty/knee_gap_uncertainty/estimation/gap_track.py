@@ -36,10 +36,8 @@ from knee_gap_uncertainty.scope_calibration.calibration_fit import explained_by
 from knee_gap_uncertainty.scope_calibration.posed_view import PosedView, posed_view
 from knee_gap_uncertainty.scope_calibration.scope_calibration import CalibrationError
 from knee_gap_uncertainty.two_view.angle_sets import INTERVAL_SIGNS, SIGNS
-from knee_gap_uncertainty.two_view.gap_range import GapRange, gap_range
+from knee_gap_uncertainty.two_view.gap_range import GapRange, gap_range_and_points
 from knee_gap_uncertainty.two_view.translation_volume import displacements
-from knee_gap_uncertainty.two_view.triangulation import triangulate
-from knee_gap_uncertainty.two_view.two_views import two_views
 
 Floats = npt.NDArray[np.float64]
 
@@ -79,6 +77,7 @@ class Track:
         self.frame_id = frame_id
         self._parameters = parameters
         self._first: PosedView | None = None
+        self._bounded: tuple[PosedView, tuple[float, float]] | None = None  # error bounds of the last view
         self._segment = 0
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
@@ -173,6 +172,7 @@ class Track:
         )
         self.suspects_creep = rate > self._calibration.drift
         self._admitted = replace(self._calibration, drift=max(rate, self._calibration.drift))
+        self._bounded = None
 
     def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
@@ -239,25 +239,25 @@ class Track:
     def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
         """Bounds from the first and the present view, and the smaller parallax of the two points [rad]."""
         angular_error, translation_error = self._error_bounds(first, present)
-        bounds = gap_range(
-            first.lens,
-            present.lens,
-            first.bearings,
-            present.bearings,
+        bounds, points = gap_range_and_points(
+            (first.lens, present.lens),
+            (first.bearings, present.bearings),
             angular_error=angular_error,
             translation_error=translation_error,
             interval=self._parameters.interval,
             apex=self._parameters.apex,
         )
-        views = two_views(first.lens, present.lens, first.bearings, present.bearings)
-        return bounds, float(np.min(triangulate(views).gamma))
+        return bounds, float(np.min(points.gamma))
 
     def _error_bounds(self, first: PosedView, present: PosedView) -> tuple[float, float]:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
+        if self._bounded is not None and self._bounded[0] is present:
+            return self._bounded[1]
         angle = max(first.angular_error, present.angular_error)
         position = max(first.translation_error, present.translation_error)
         shared = self._admitted.bounds(first, present, self._parameters.tracker_bound)
-        return angle + shared[0], position + shared[1]
+        self._bounded = present, (angle + shared[0], position + shared[1])
+        return self._bounded[1]
 
     def _measured(
         self,

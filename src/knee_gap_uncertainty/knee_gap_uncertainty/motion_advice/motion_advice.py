@@ -137,12 +137,15 @@ class MotionAdvice(NamedTuple):
     best: Prospect
 
 
-def snr_after(situation: Situation, offset: Floats) -> float:
-    """Signal-to-noise ratio of the gap `offset` (3,) [m] further on; 0 where it is unbounded."""
+def snr_after(situation: Situation, offset: Floats, places: Floats | None = None) -> float:
+    """Signal-to-noise ratio of the gap `offset` (3,) [m] further on; 0 where it is unbounded.
+
+    `places` are those of `places_of`, if they are known already.
+    """
     lens = situation.lens + offset
     if not float(np.linalg.norm(lens - situation.first_lens)) > 2.0 * situation.translation_error:
         return 0.0
-    edges = edges_after(situation, lens)
+    edges = edges_after(situation, lens, places)
     bearings = unit(situation.points - lens)
     opening = opening_of(bearings, edges.bearings)
     gap_min, gap_max = worst_case(
@@ -159,8 +162,11 @@ def snr_after(situation: Situation, offset: Floats) -> float:
     return widest_gap(situation.points, lens, opening, edges) / (gap_max - gap_min)
 
 
-def width_after(situation: Situation, offset: Floats) -> float:
-    """Width of the gap's confidence interval [m] `offset` (3,) [m] further on; infinite where refused."""
+def width_after(situation: Situation, offset: Floats, places: Floats | None = None) -> float:
+    """Width of the gap's confidence interval [m] `offset` (3,) [m] further on; infinite where refused.
+
+    `places` as in `snr_after`.
+    """
     try:
         views = views_after(situation, offset)
         fitted = fit(views)
@@ -172,17 +178,23 @@ def width_after(situation: Situation, offset: Floats) -> float:
     lens = situation.lens + offset
     if not np.isfinite(fitted.points).all():
         return inf
-    edges = edges_after(situation, lens)
+    edges = edges_after(situation, lens, places)
     opening = opening_of(unit(situation.points - lens), edges.bearings)
     radius = float(ndtri(0.5 + 0.5 * situation.confidence_level))
     found = instrument_gap(fitted, lens, opening, edges, radius)
     return found.upper - found.lower
 
 
-def edges_after(situation: Situation, lens: Floats) -> Edges:
-    """The edges as another lens (3,) [m] sees them: at the same places of the tissue, as far as they go."""
+def places_of(situation: Situation) -> Floats:
+    """Where the edges lie on the tissue (2, 3) [m]."""
     opening = opening_of(unit(situation.points - situation.lens), situation.edges.bearings)
-    places = edge_points(situation.lens, situation.points, opening, situation.edges)
+    return edge_points(situation.lens, situation.points, opening, situation.edges)
+
+
+def edges_after(situation: Situation, lens: Floats, places: Floats | None = None) -> Edges:
+    """The edges as another lens (3,) [m] sees them: at the same places of the tissue, as far as they go."""
+    if places is None:
+        places = places_of(situation)
     return situation.edges._replace(bearings=unit(places - lens))
 
 
@@ -301,9 +313,9 @@ class MotionAdvisor:
     def _prospect(self, situation: Situation, direction: Floats) -> Generator[None, None, Prospect]:
         """Scan one direction; yields None, returns the Prospect."""
         is_snr = self.parameters.advice_target == "snr"
-        value_after = snr_after if is_snr else width_after
+        value_after, places = snr_after if is_snr else width_after, places_of(situation)
         pieces = scan(
-            lambda travel: value_after(situation, travel * direction),
+            lambda travel: value_after(situation, travel * direction, places),
             self.parameters.target,
             self.parameters.farthest_travel,
             more_is_better=is_snr,

@@ -16,7 +16,7 @@ from knee_gap_uncertainty.two_view.error_cloud import refuse_parallel, trace_clo
 from knee_gap_uncertainty.two_view.extremes import extremes
 from knee_gap_uncertainty.two_view.slices import slice_spokes
 from knee_gap_uncertainty.two_view.translation_volume import displacements
-from knee_gap_uncertainty.two_view.triangulation import SMALLEST_ANGLE, triangulate
+from knee_gap_uncertainty.two_view.triangulation import SMALLEST_ANGLE, Triangulation, triangulate
 from knee_gap_uncertainty.two_view.two_views import TwoViews, two_views
 
 LARGEST_ANGULAR_ERROR = math.pi / 2
@@ -71,12 +71,34 @@ def gap_range(
     Raises BadInputError, BaselineTooShortError, EpipoleError, CheiralityError or UnderconstrainedError,
     all of them MeasurementError, where no honest range exists.
     """
+    return gap_range_and_points(
+        (lens_0, lens_1),
+        (bearings_0, bearings_1),
+        angular_error=angular_error,
+        translation_error=translation_error,
+        interval=interval,
+        apex=apex,
+        radii=radii,
+    )[0]
+
+
+def gap_range_and_points(
+    lenses: tuple[npt.ArrayLike, npt.ArrayLike],
+    bearings: tuple[npt.ArrayLike, npt.ArrayLike],
+    *,
+    angular_error: float,
+    translation_error: float,
+    interval: Interval = "worst_case",
+    apex: Literal["first", "second", "best"] = "first",
+    radii: int = 1,
+) -> tuple[GapRange, Triangulation]:
+    """As `gap_range`, with the points that it is about."""
     signs = checked_choices(interval, apex, radii)
     psi = checked_error("angular_error", angular_error, "rad")
     if psi >= LARGEST_ANGULAR_ERROR:
         raise BadInputError(f"angular_error must be below pi/2 rad, got {psi:g}: a wider cone is no bearing")
     shift = checked_error("translation_error", translation_error, "m")
-    views = two_views(lens_0, lens_1, bearings_0, bearings_1)
+    views = two_views(*lenses, *bearings)
     if 2 * shift >= views.baseline:
         raise BaselineTooShortError(
             f"the travel must exceed twice the translation error: "
@@ -92,8 +114,8 @@ def gap_range(
     best = max(ranges, key=lambda found: (found.snr, found.gap_min))
     lowest = min(found.gap_min for found in ranges)
     if interval == "worst_case" and lowest < FAR_NEARER * best.gap_min:
-        return ranged(best.gap, lowest, best.gap_max)
-    return best
+        best = ranged(best.gap, lowest, best.gap_max)
+    return best, points
 
 
 def range_from_apex(
