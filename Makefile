@@ -1,7 +1,7 @@
 # knee_gap: two commands, `make demo` and `make test`; both set up whatever is missing.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup anatomy demo test lint bench faults clean
+.PHONY: help setup anatomy training demo test lint bench faults clean
 
 help: ## show what there is
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
@@ -11,6 +11,9 @@ setup: ## set up whatever is missing
 
 anatomy: setup ## add what knees of meshes need (make_bag --anatomy)
 	@tools/env sh -c 'uv pip install -q --python "$$(command -v python)" --require-hashes -r tools/requirements/anatomy.lock'
+
+training: setup ## add what train_segmentation needs (JAX)
+	@tools/env sh -c 'uv pip install -q --python "$$(command -v python)" --require-hashes -r tools/requirements/training.lock'
 
 demo: setup ## play the sample bag through the live nodes; results in out/demo
 	@tools/run knee_gap_bringup demo

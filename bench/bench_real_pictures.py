@@ -57,6 +57,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, nargs="?", default=PICTURES, help="folder of picture folders")
     parser.add_argument("--marks", type=Path, nargs="+", default=sorted(MARKS.glob("*.json")), metavar="FILE")
     parser.add_argument("--segmentation", choices=WITHOUT_NETWORK, help="instead of the default")
+    parser.add_argument(
+        "--without",
+        type=Path,
+        metavar="FOLDER",
+        help="score each source with the network of train_segmentation that was trained without it",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/real_pictures"), metavar="FOLDER")
     asked = parser.parse_args(argv)
     cv2.setNumThreads(1)
@@ -68,6 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     sections: list[PictureScore] = []
     try:
         for picture, image in marked(asked.marks, asked.folder):
+            if asked.without is not None:
+                weights = network_without(asked.without, picture.source)
+                parameters = replace(parameters, segmentation="learned", network_path=str(weights))
             score, points = score_picture(picture, image, parameters)
             scores.append(score)
             sections.append(score_picture(picture, image, replace(parameters, minimum_confidence=0.0))[0])
@@ -86,6 +95,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(text)
     print(f"{asked.out}: table.md, pictures.csv, sheet.jpg")
     return 0
+
+
+def network_without(folder: Path, source: str) -> Path:
+    """The network of a folder that was trained without a source. Raises PerceptionError if there is none."""
+    for path in sorted(folder.glob("without_*.onnx")):
+        if source in path.stem.removeprefix("without_").split("+"):
+            return path
+    raise PerceptionError(f"{folder} holds no network that was trained without the source '{source}'")
 
 
 def marked(files: Sequence[Path], folder: Path) -> Iterator[tuple[MarkedPicture, Image]]:

@@ -10,7 +10,7 @@ setup(
     maintainer="knee_gap maintainers",
     maintainer_email="maintainers@knee-gap.invalid",
     packages=find_packages(),
-    package_data={"": ["py.typed", "*.html"]},
+    package_data={"": ["py.typed", "*.html", "*.onnx"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + NAME]),
         ("share/" + NAME, ["package.xml"]),
@@ -23,6 +23,7 @@ setup(
             "segmentation_node = knee_gap_perception.entry_points:segmentation_node",
             "tracker_precision = knee_gap_perception.entry_points:tracker_precision",
             "tracking_node = knee_gap_perception.entry_points:tracking_node",
+            "train_segmentation = knee_gap_perception.entry_points:train_segmentation",
         ],
     },
 )

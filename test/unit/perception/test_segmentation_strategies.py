@@ -10,7 +10,8 @@ import pytest
 
 from knee_gap_core.values.arrays import Image, Mask
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.segmentation.choice import STRATEGIES, WITHOUT_NETWORK, segmentation_named
+from knee_gap_perception.segmentation.choice import LEARNED, STRATEGIES, WITHOUT_NETWORK, segmentation_named
+from knee_gap_perception.segmentation.learned import Learned
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.three_classes import otsu3
 from knee_gap_perception.segmentation.thresholds import otsu_threshold
@@ -30,7 +31,11 @@ def drawn() -> tuple[Image, Mask, Mask]:
     return np.clip(image, 0, 255).astype(np.uint8), field, gap
 
 
-@pytest.mark.parametrize("name", WITHOUT_NETWORK)
+# The network was trained on tissue, and knows no drawn bands.
+CLASSICAL = [name for name in WITHOUT_NETWORK if name != LEARNED]
+
+
+@pytest.mark.parametrize("name", CLASSICAL)
 def test_strategies_find_the_gap(name: str, drawn: tuple[Image, Mask, Mask]) -> None:
     image, field, gap = drawn
     dark = segmentation_named(name)(image, field)
@@ -125,7 +130,7 @@ def tensor(name: str, values: npt.NDArray[np.float32]) -> bytes:
 def one_by_one_network(
     weight: npt.NDArray[np.float32], bias: npt.NDArray[np.float32], size: tuple[int, int]
 ) -> bytes:
-    """An ONNX model of a single 1x1 convolution, weight (out, 3, 1, 1) and bias (out,)."""
+    """An ONNX model of a single 1x1 convolution, weight (out, in, 1, 1) and bias (out,)."""
     shape = chunk(5, chunk(1, "kernel_shape") + number(8, 1) + number(8, 1) + number(20, 7))
     node = (
         chunk(1, "picture")
@@ -140,7 +145,7 @@ def one_by_one_network(
         + chunk(2, "one")
         + chunk(5, tensor("weight", weight))
         + chunk(5, tensor("bias", bias))
-        + chunk(11, value_info("picture", (1, 3, size[1], size[0])))
+        + chunk(11, value_info("picture", (1, weight.shape[1], size[1], size[0])))
         + chunk(12, value_info("gap", (1, weight.shape[0], size[1], size[0])))
     )
     return number(1, 7) + chunk(7, graph) + chunk(8, chunk(1, "") + number(2, 11))
@@ -184,6 +189,13 @@ def test_a_network_with_two_classes(network_file: Any, drawn: tuple[Image, Mask,
     assert 2 * (dark & gap).sum() / (dark.sum() + gap.sum()) > 0.9
     with pytest.raises(PerceptionError, match="channel 2"):
         Network(path, input_size=(128, 96), gap_channel=2)(image, field)
+
+
+@pytest.mark.parametrize("channels", [3, 5])
+def test_a_network_of_another_shape_is_not_the_projects_own(channels: int, network_file: Any) -> None:
+    with pytest.raises(PerceptionError, match="not one of the segmentation 'learned'") as refusal:
+        Learned(network_file([[1.0] * channels, [0.0] * channels], [0.0, 1.0]))
+    assert "\n" not in str(refusal.value).strip()
 
 
 def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:

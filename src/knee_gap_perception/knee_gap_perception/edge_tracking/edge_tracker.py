@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -12,12 +13,14 @@ from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges, SectionEd
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera import Camera, bearing_jacobian
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.gap_detection.cross_section import Section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.gap_detection.gap_detector import Found, GapSearch, NoPointsError, check_light
 from knee_gap_perception.gap_detection.section_edges import SectionEdgeFinder
 from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, why_no_field
 from knee_gap_perception.point_tracking.point_selection import SurfacePoint, choose_points
 from knee_gap_perception.point_tracking.point_tracker import PointObservation, PointTracker
+from knee_gap_perception.point_tracking.points_beside_opening import points_beside_opening
 from knee_gap_perception.point_tracking.tangent_plane import View
 
 AROUND_EDGES = 40.0  # [px] beyond the tracked points within which instruments are looked for
@@ -271,8 +274,7 @@ class GapEdgeTracker:
     ) -> list[PointObservation]:
         """Find the gap, choose the points and begin a track."""
         found = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
-        section = found.section
-        points = self._chosen_points(grey, camera, field, found)
+        section, points = self._chosen_points(grey, camera, field, found)
         first, second = (
             PointTracker(grey, point.pixel, point.dark_below, camera, view, point.kind) for point in points
         )
@@ -291,17 +293,20 @@ class GapEdgeTracker:
 
     def _chosen_points(
         self, grey: Image, camera: Camera, field: FieldOfView, found: Found
-    ) -> list[SurfacePoint]:
-        """The two points beside a section that was found; raises NoPointsError where a side has none."""
-        inset_px = self.parameters.inset / camera.radians_per_pixel(found.section.centre)
-        points = choose_points(
-            grey, found.section, field, inset_px, found.foreign, found.scale, found.instruments
-        )
-        if points is None:
-            raise NoPointsError(
-                EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found"
-            )
-        return points
+    ) -> tuple[Section, list[SurfacePoint]]:
+        """A section that was found and the two points beside it; raises NoPointsError if a side has none."""
+        for section in chain([found.section], found.others):
+            inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
+            if found.opening is not None:
+                masks = found.opening, found.instruments, found.foreign & ~found.instruments
+                points = points_beside_opening(grey, section, field, inset_px, masks, found.scale)
+            else:
+                points = choose_points(
+                    grey, section, field, inset_px, found.foreign, found.scale, found.instruments
+                )
+            if points is not None:
+                return section, points
+        raise NoPointsError(EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found")
 
     def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
         """Refuse a picture in which nothing can be seen, for one thing a lamp that went out.

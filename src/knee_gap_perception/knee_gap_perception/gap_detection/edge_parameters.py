@@ -20,7 +20,11 @@ class EdgeParameters:
         metadata={"description": "Segmentation method for the dark gap", "choices": tuple(STRATEGIES)},
     )
     network_path: str = field(
-        default="", metadata={"description": "ONNX file for the segmentation 'onnx': image in, gap out"}
+        default="",
+        metadata={
+            "description": "ONNX file for the segmentation 'onnx': image in, gap out; or other "
+            "weights of 'learned'"
+        },
     )
     network_input_size: tuple[int, ...] = field(
         default=(256, 256),

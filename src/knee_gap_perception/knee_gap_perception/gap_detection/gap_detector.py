@@ -1,5 +1,6 @@
 """Gap detector for one image: segmentation, section, and the decision whether it is a gap."""
 
+from collections.abc import Iterator
 from math import ceil, floor
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from knee_gap_perception.gap_detection.confidence import gap_confidence
 from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
 from knee_gap_perception.gap_detection.cross_section import Section, find_section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
+from knee_gap_perception.gap_detection.learned_gap import REACH, learned_gap, learned_sections
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 from knee_gap_perception.image.instruments_and_glare import (
     USUAL_LIMIT,
@@ -21,7 +23,8 @@ from knee_gap_perception.image.instruments_and_glare import (
     metal_and_glare,
 )
 from knee_gap_perception.image.shafts import find_shafts
-from knee_gap_perception.segmentation.choice import STRATEGIES, segmentation_named
+from knee_gap_perception.segmentation.choice import LEARNED, STRATEGIES, segmentation_named
+from knee_gap_perception.segmentation.learned import Learned
 
 DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the image is too dark
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
@@ -41,13 +44,16 @@ class NoPointsError(Exception):
 class Found(NamedTuple):
     """A section, and what is not tissue in the image reduced by `scale`.
 
-    `foreign` (h, w) are instruments and glare, `instruments` (h, w) those alone.
+    `foreign` (h, w) are instruments and glare, `instruments` (h, w) those alone. `opening` (h, w) is the gap
+    where a network drew its edges, which need not be steps of brightness; `others` are more sections of it.
     """
 
     section: Section
     foreign: Mask
     instruments: Mask
     scale: float
+    opening: Mask | None = None
+    others: Iterator[Section] = iter(())
 
 
 class GapSearch:
@@ -73,8 +79,11 @@ class GapSearch:
         """Mask (h, w) of the gap in an image (h, w, 3): 255 in the gap, 0 elsewhere."""
         small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
-        foreign, *_ = self._foreign(picture, small, brightness(small), field, scale)
-        dark = self._segmentation(small, inside & ~foreign)
+        if isinstance(self._segmentation, Learned):
+            dark = learned_gap(self._segmentation.classes(small, inside), inside).opening
+        else:
+            foreign, *_ = self._foreign(picture, small, brightness(small), field, scale)
+            dark = self._segmentation(small, inside & ~foreign)
         size = (picture.shape[1], picture.shape[0])
         full = cv2.resize(dark.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return np.where(full > 127, 255, 0).astype(np.uint8)
@@ -129,6 +138,8 @@ class GapSearch:
         )
         value = brightness(small)
         light = check_light(value[inside])
+        if isinstance(self._segmentation, Learned):
+            return self._learned(self._segmentation, picture, small, camera, field, clicked)
         foreign, instruments, shafts = self._foreign(picture, small, value, field, scale)
         dark = self._segmentation(small, inside & ~foreign)
         section = find_section(dark, value, foreign, field, scale, self._region(field, clicked), shafts)
@@ -136,13 +147,7 @@ class GapSearch:
             raise NoPointsError(
                 EdgeStatus.NO_GAP, "no dark gap with tissue on both sides in the region of interest"
             )
-        width = float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
-        if not width >= self.parameters.minimum_width:
-            raise NoPointsError(
-                EdgeStatus.NO_GAP,
-                f"the dark part is {np.degrees(width):.1f} deg wide, a gap is at least "
-                f"{np.degrees(self.parameters.minimum_width):.1f} deg",
-            )
+        self._check_width(section, camera, "dark part")
         confidence = self.confidence = gap_confidence(
             section, field.extent, light, small, dark, scale, pointed_at=clicked is not None
         )
@@ -153,6 +158,54 @@ class GapSearch:
                 f"{self.parameters.minimum_confidence:.2f}",
             )
         return Found(section, foreign, instruments, scale)
+
+    def _learned(
+        self,
+        network: Learned,
+        picture: Image,
+        small: Image,
+        camera: Camera,
+        field: FieldOfView,
+        clicked: Array | None,
+    ) -> Found:
+        """As `section`, where a network of the project decides what is a gap and what an instrument."""
+        shape, value = (small.shape[0], small.shape[1]), brightness(small)
+        scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
+        whole = field.mask(shape, scale)
+        seen = learned_gap(network.classes(small, whole), whole)
+        glare = seen.glare | metal_and_glare(small, least_warmth(picture))[1]
+        centre, radius = self._region(field, clicked)
+        if clicked is None:
+            radius = max(radius, REACH * field.extent)
+        sections = learned_sections(seen, value, field, scale, (centre, radius))
+        first = next(sections, None)
+        if first is None:
+            raise NoPointsError(EdgeStatus.NO_GAP, "no opening with tissue on both sides is seen")
+        section, self.confidence = first
+        self._check_width(section, camera, "opening")
+        least = self.parameters.minimum_confidence
+        if self.confidence < least:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the opening has a confidence of {self.confidence:.2f}, needed is {least:.2f}",
+            )
+        others = (
+            other
+            for other, confidence in sections
+            if confidence >= least and _width(other, camera) >= self.parameters.minimum_width
+        )
+        foreign = seen.instruments | glare
+        return Found(section, foreign, seen.instruments, scale, seen.opening, others)
+
+    def _check_width(self, section: Section, camera: Camera, what: str) -> None:
+        """Raises NoPointsError if a section is too narrow."""
+        width = _width(section, camera)
+        if not width >= self.parameters.minimum_width:
+            raise NoPointsError(
+                EdgeStatus.NO_GAP,
+                f"the {what} is {np.degrees(width):.1f} deg wide, a gap is at least "
+                f"{np.degrees(self.parameters.minimum_width):.1f} deg",
+            )
 
     def _foreign(
         self, picture: Image, small: Image, value: Image, field: FieldOfView, scale: float
@@ -180,6 +233,11 @@ class GapSearch:
             return clicked, min(radius, 0.2 * field.extent)
         centre = np.array(self.parameters.region_centre)
         return np.where(np.isnan(centre), np.array(field.centre), centre), radius
+
+
+def _width(section: Section, camera: Camera) -> float:
+    """Angle across a section [rad]; NaN if the camera model does not describe it."""
+    return float(np.arccos(np.clip(np.prod(camera.bearings(section.edges), axis=0).sum(), -1.0, 1.0)))
 
 
 def _within(first: float, last: float, size: int) -> tuple[int, int]:
@@ -213,6 +271,8 @@ def _level_exceeded(values: Image) -> float:
 
 def _settings(parameters: EdgeParameters) -> dict[str, object]:
     """Settings of the segmentation that the parameters name."""
+    if parameters.segmentation == LEARNED:
+        return {"path": parameters.network_path}
     if not STRATEGIES[parameters.segmentation].needs_network:
         return {}
     return {

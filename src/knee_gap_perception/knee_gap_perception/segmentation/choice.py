@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from knee_gap_perception.errors import PerceptionError
+from knee_gap_perception.segmentation.learned import Learned
 from knee_gap_perception.segmentation.network import Network
 from knee_gap_perception.segmentation.strategy import Segmentation
 from knee_gap_perception.segmentation.thresholds import Adaptive, Otsu, Otsu3
@@ -29,6 +30,7 @@ def _chan_vese(**settings: Any) -> Segmentation:
     return ChanVese(**settings)
 
 
+LEARNED = "learned"
 # A new strategy is a module with a Segmentation, and a row here.
 STRATEGIES: dict[str, Strategy] = {
     "otsu": Strategy(Otsu),
@@ -36,6 +38,7 @@ STRATEGIES: dict[str, Strategy] = {
     "adaptive": Strategy(Adaptive),
     "watershed": Strategy(_watershed),
     "chan_vese": Strategy(_chan_vese),
+    LEARNED: Strategy(Learned),
     "onnx": Strategy(Network, needs_network=True),
 }
 # What works without a file of the user's.
