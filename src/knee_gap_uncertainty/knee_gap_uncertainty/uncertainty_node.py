@@ -24,7 +24,7 @@ from knee_gap_uncertainty.inputs.message_sequence import MessageSequence
 from knee_gap_uncertainty.motion_advice.advice_task import AdvicePace
 
 # How often time is let pass when no message does it [s].
-TICK = 0.02
+TICK = 0.01
 # Topics of one publisher each, whose messages continue one another.
 CONTINUED = (GAP_EDGES.topic, SCOPE_POSE.topic, SCOPE_ROTATION.topic)
 
