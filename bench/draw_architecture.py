@@ -48,13 +48,13 @@ TRACKING = (
 )
 UNCERTAINTY = (
     Box(8.9, 5.4, "pose and rotation\nat the image", "inputs", GAP),
-    Box(10.9, 5.4, "rules for image,\npose, leg", "acceptance", GAP),
+    Box(10.9, 5.4, "rules for image,\npose, leg", "estimation/\nacceptance", GAP),
     Box(12.9, 5.4, "one view, with the\ncalibration's error", "scope_calibration", GAP),
     Box(14.9, 5.4, "fit over all views", "multi_view", GAP),
     Box(14.9, 4.1, "has the joint\nmoved?", "joint_motion", GAP),
     Box(12.9, 4.1, "bounds (two views),\ninterval (all views)", "two_view\nmulti_view", GAP),
     Box(10.9, 4.1, "instrument gap,\nits bounds", "instrument_gap", GAP),
-    Box(8.9, 4.1, "rules for the\nnumbers", "acceptance", GAP),
+    Box(8.9, 4.1, "rules for the\nnumbers", "estimation/\nacceptance", GAP),
 )
 
 
@@ -71,11 +71,16 @@ PANELS = (
     Panel(
         (1.9, 7.35, 14.0, 2.85),
         "segmentation_node",
-        "EdgeStream (edge_tracking), GapEdgeTracker",
+        "SegmentationCore, EdgeStream, GapEdgeTracker (edge_tracking)",
         (2.1, 9.95),
     ),
-    Panel((1.9, 3.1, 4.2, 2.95), "tracking_node", "ScopeTracker (scope_pose)", (2.1, 3.35)),
-    Panel((7.9, 3.1, 8.0, 2.95), "uncertainty_node", "GapEstimator, Track", (9.3, 3.35)),
+    Panel((1.9, 3.1, 4.2, 2.95), "tracking_node", "TrackingCore (scope_pose)", (2.1, 3.35)),
+    Panel(
+        (7.9, 3.1, 8.0, 2.95),
+        "uncertainty_node",
+        "UncertaintyCore, GapEstimator, Track (estimation)",
+        (9.3, 3.35),
+    ),
 )
 
 
