@@ -51,6 +51,54 @@ def test_an_opening_is_a_gap() -> None:
     assert confidence > 0.9
 
 
+def test_shade_at_the_rim_does_not_make_an_opening_uneven() -> None:
+    alone = decided(banded(1.0, 1.0))[1]
+    image = banded(1.0, 1.0)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    away = np.hypot(columns - WIDTH / 2, rows - HEIGHT / 2)
+    shade = (away < RADIUS - 1) & (away > 0.8 * RADIUS) & (np.abs(rows - HEIGHT / 2) > 2.5 * HALF_BAND)
+    # As dark as the opening, with specks.
+    image[shade] = np.where(np.random.default_rng(1).random(shade.sum()) < 0.2, 60, 6)[:, None]
+    assert abs(decided(image)[1] - alone) < 0.02
+
+
+def test_points_are_followed_in_a_channel_that_is_not_clipped() -> None:
+    image = banded(1.0, 1.0)
+    image[..., 1] = np.where(image[..., 1] > 60, 248, image[..., 1])
+    detector = GapEdgeTracker()
+    for index in range(3):
+        edges = detector.process(index * FRAME_NS, cv2.add(image, np.full_like(image, index % 2)), CAMERA)
+        assert edges.status is EdgeStatus.VALID, detector.reason
+    image[..., 0] = image[..., 2] = image[..., 1]
+    detector = GapEdgeTracker()
+    assert detector.process(0, image, CAMERA).status is EdgeStatus.LOW_CONTRAST
+    assert "textured" in detector.reason
+
+
+def lit_wall(behind: tuple[float, float, float]) -> Image:
+    """A band of another colour (3,) between textured tissue."""
+    image = banded(1.0, 1.0).astype(np.float64)
+    across = np.abs(np.mgrid[:HEIGHT, :WIDTH][0] - HEIGHT / 2)
+    inside = (across < HALF_BAND - 2) & (image.max(axis=2) > 0)
+    image[inside] = behind
+    noise = 2.0 * np.random.default_rng(4).standard_normal(image.shape[:2])[..., None]
+    return np.clip(image + noise * inside[..., None], 0, 255).astype(np.uint8)
+
+
+def test_a_red_wall_is_a_gap_only_where_it_is_pointed_at() -> None:
+    image = lit_wall((30.0, 34.0, 92.0))
+    detector = GapEdgeTracker()
+    assert detector.process(0, image, CAMERA).status is EdgeStatus.NO_GAP
+    assert detector.choose_near([WIDTH / 2, HEIGHT / 2], CAMERA) == ""
+    assert detector.process(FRAME_NS, cv2.add(image, np.ones_like(image)), CAMERA).status is EdgeStatus.VALID
+
+
+def test_a_crease_is_no_gap_where_it_is_pointed_at() -> None:
+    detector = GapEdgeTracker()
+    detector.process(0, banded(280.0, 280.0, gap=4.0), CAMERA)
+    assert "shaded tissue" in detector.choose_near([WIDTH / 2, HEIGHT / 2], CAMERA)
+
+
 def test_an_opening_under_rounded_bone_is_a_gap() -> None:
     # One side turns away from the lamp, the other is a rim.
     assert decided(banded(60.0, 1.0))[0] is EdgeStatus.VALID

@@ -66,3 +66,39 @@ def test_a_point_may_be_nearer_to_glare_than_to_an_instrument():
     assert abs(SCALE * upper.pixel[0] - 160.0) < 4 + AWAY
     column, row = np.rint(SCALE * upper.pixel).astype(int)
     assert not spot[row, column]
+
+
+def test_a_smaller_picture_has_its_points_at_the_same_places():
+    scale = 0.4
+    small = cv2.resize(_gap(), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    section = Section(
+        centre=SECTION.centre * scale,
+        radius=SECTION.radius * scale,
+        edges=SECTION.edges * scale,
+        contrast=SECTION.contrast,
+        levels=SECTION.levels,
+        sharpness=SECTION.sharpness,
+    )
+    field = FieldOfView((255.5, 143.5), 142.0, (0.0, 0.0, 511.0, 287.0))
+    # In the small picture a large patch would not lie inside the field.
+    shifted = FieldOfView((255.5, 143.5 + 45.0), 142.0, (0.0, 0.0, 511.0, 287.0))
+    for one in (field, shifted):
+        points = choose_points(small, section, one, INSET_PX * scale, NOTHING, SCALE / scale)
+        upper, lower = (point.pixel / scale for point in points)
+        for pixel, row in ((upper, 300.0 - INSET_PX), (lower, 420.0 + INSET_PX)):
+            assert abs(pixel[1] - row) <= 0.25 * INSET_PX + 4.0
+            assert abs(pixel[0] - 640.0) <= 120.0
+
+
+def test_points_near_the_rim_are_taken_where_there_are_no_others():
+    # The upper edge lies 50 px inside the field.
+    low = FieldOfView((639.5, 604.5), 355.0, (0.0, 0.0, 1279.0, 1279.0))
+    image = _gap()
+    rows, columns = np.mgrid[:720, :1280]
+    image[np.hypot(columns - 639.5, rows - 604.5) > 355.0] = 0
+    upper, _ = choose_points(image, SECTION, low, INSET_PX, NOTHING, SCALE)
+    assert abs(upper.pixel[1] - (300.0 - INSET_PX)) <= 0.25 * INSET_PX + 1.0
+    assert low.depth_inside(upper.pixel) > 18.0
+    # Beyond the rim there is no tissue.
+    outside = FieldOfView((639.5, 650.5), 355.0, (0.0, 0.0, 1279.0, 1279.0))
+    assert choose_points(image, SECTION, outside, INSET_PX, NOTHING, SCALE) is None

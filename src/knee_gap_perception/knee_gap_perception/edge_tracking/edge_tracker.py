@@ -23,12 +23,18 @@ from knee_gap_perception.point_tracking.point_tracker import PointObservation, P
 from knee_gap_perception.point_tracking.points_beside_opening import points_beside_opening
 from knee_gap_perception.point_tracking.tangent_plane import View
 
+# Channels of the image in which points are looked for, one after the other: green has the least noise, but a
+# cast or a strong lamp clips one channel before the others.
+CHANNELS = (1, 0, 2)
 AROUND_EDGES = 40.0  # [px] beyond the tracked points within which instruments are looked for
 
 
 @dataclass(frozen=True)
 class _Track:
-    """Two points being followed; `pose_frame` is that of the lens poses from its first image on, if any."""
+    """Two points being followed in a `channel` of the images.
+
+    `pose_frame` is that of the lens poses from its first image on, if any.
+    """
 
     track_id: int
     points: tuple[PointTracker, PointTracker]
@@ -36,6 +42,7 @@ class _Track:
     pose_frame: str | None
     clicked: Array | None
     edges: SectionEdgeFinder
+    channel: int
 
 
 class GapEdgeTracker:
@@ -119,9 +126,7 @@ class GapEdgeTracker:
             return "the point lies outside the field of view"
         try:
             found = self._search.section(self._image, camera, field, clicked)
-            self._chosen_points(
-                np.asarray(cv2.extractChannel(self._image, 1), np.uint8), camera, field, found
-            )
+            self._chosen_points(self._image, camera, field, found)
         except (NoPointsError, PerceptionError) as refusal:
             return str(refusal)
         self.choose_at(clicked)
@@ -214,11 +219,11 @@ class GapEdgeTracker:
         if field is None:
             self.end_track()
             raise NoPointsError(EdgeStatus.LOW_CONTRAST, why_no_field(picture))
-        grey = np.asarray(cv2.extractChannel(picture, 1), np.uint8)
         if self._track is None:
-            observations = self._start(stamp_ns, picture, grey, camera, view, field)
+            observations, grey = self._start(stamp_ns, picture, camera, view, field)
         else:
             self._check_light_while_tracking(stamp_ns, picture, field)
+            grey = _channel(picture, self._track.channel)
             observations = self._follow(stamp_ns, grey, camera, view, field)
         edges = self._edges(stamp_ns, frame_id, camera, observations)
         first, second = observations
@@ -267,14 +272,14 @@ class GapEdgeTracker:
         self,
         stamp_ns: int,
         picture: Image,
-        grey: Image,
         camera: Camera,
         view: View | None,
         field: FieldOfView,
-    ) -> list[PointObservation]:
-        """Find the gap, choose the points and begin a track."""
+    ) -> tuple[list[PointObservation], Image]:
+        """Find the gap, choose the points and begin a track; also the channel that shows them."""
         found = self._search.agreed_section(stamp_ns, picture, camera, field, self._clicked)
-        section, points = self._chosen_points(grey, camera, field, found)
+        section, points, channel = self._chosen_points(picture, camera, field, found)
+        grey = _channel(picture, channel)
         first, second = (
             PointTracker(grey, point.pixel, point.dark_below, camera, view, point.kind) for point in points
         )
@@ -286,26 +291,32 @@ class GapEdgeTracker:
             self._pose_frame if view is not None else None,
             self._clicked,
             SectionEdgeFinder(section.centre, section.across, np.stack([point.pixel for point in points])),
+            channel,
         )
         self._next_track_id += 1
         self._clicked = None
-        return [first.first, second.first]
+        return [first.first, second.first], grey
 
     def _chosen_points(
-        self, grey: Image, camera: Camera, field: FieldOfView, found: Found
-    ) -> tuple[Section, list[SurfacePoint]]:
-        """A section that was found and the two points beside it; raises NoPointsError if a side has none."""
+        self, picture: Image, camera: Camera, field: FieldOfView, found: Found
+    ) -> tuple[Section, list[SurfacePoint], int]:
+        """A section that was found, the two points beside it, and the channel of the image that shows them.
+
+        Raises NoPointsError if a side has none in any channel.
+        """
         for section in chain([found.section], found.others):
             inset_px = self.parameters.inset / camera.radians_per_pixel(section.centre)
-            if found.opening is not None:
-                masks = found.opening, found.instruments, found.foreign & ~found.instruments
-                points = points_beside_opening(grey, section, field, inset_px, masks, found.scale)
-            else:
-                points = choose_points(
-                    grey, section, field, inset_px, found.foreign, found.scale, found.instruments
-                )
-            if points is not None:
-                return section, points
+            for channel in CHANNELS:
+                grey = _channel(picture, channel)
+                if found.opening is not None:
+                    masks = found.opening, found.instruments, found.foreign & ~found.instruments
+                    points = points_beside_opening(grey, section, field, inset_px, masks, found.scale)
+                else:
+                    points = choose_points(
+                        grey, section, field, inset_px, found.foreign, found.scale, found.instruments
+                    )
+                if points is not None:
+                    return section, points, channel
         raise NoPointsError(EdgeStatus.LOW_CONTRAST, "beside the gap no edge with textured tissue was found")
 
     def _check_light_while_tracking(self, stamp_ns: int, picture: Image, field: FieldOfView) -> None:
@@ -376,6 +387,11 @@ class GapEdgeTracker:
             covariances=covariances,
             angular_error=angular_error,
         )
+
+
+def _channel(picture: Image, channel: int) -> Image:
+    """One channel (h, w) of an image (h, w, 3)."""
+    return np.asarray(cv2.extractChannel(picture, channel), np.uint8)
 
 
 @lru_cache(maxsize=4)

@@ -51,9 +51,10 @@ def gap_confidence(
     [grey levels] the brightness of fully lit tissue. How even other dark parts are, such as the shade at the
     rim of the field, does not matter.
 
-    Where a person has `pointed_at` it, an organ or an instrument is not in question, only a crease: colour,
-    unevenness and width, which tell those apart, do not count.
+    Where a person has `pointed_at` it, an organ or a thin instrument is not in question, only a crease:
+    colour and width, which tell those apart, do not count.
     """
+    part = dark if section.part is None else section.part
     sharper = float(section.sharpness.max())
     lit = min(float(section.levels[1:].max()) / light, 1.0)
     evidence = (
@@ -61,14 +62,12 @@ def gap_confidence(
         + BLUNT_WEIGHT * float(section.sharpness.min())
         + SHARP_WEIGHT * sharper
         + SHADE_WEIGHT * (1.0 - sharper) * (1.0 - lit)
+        + UNEVENNESS_WEIGHT * min(unevenness(image, part), MOST_UNEVEN)
         + OFFSET
     )
     if not pointed_at:
-        part = dark if section.part is None else section.part
-        evidence += (
-            UNEVENNESS_WEIGHT * min(unevenness(image, part), MOST_UNEVEN)
-            + PIGMENT_WEIGHT * pigment(section, image, scale)
-            + SLIT_WEIGHT * np.log(np.clip(section.radius / field_radius, NARROWEST, WIDE) / WIDE)
+        evidence += PIGMENT_WEIGHT * pigment(section, image, scale) + SLIT_WEIGHT * np.log(
+            np.clip(section.radius / field_radius, NARROWEST, WIDE) / WIDE
         )
     return float(1.0 / (1.0 + np.exp(-evidence)))
 

@@ -30,6 +30,7 @@ DARK_PICTURE = 40  # [grey levels] brightest twentieth of the field; below, the 
 BRIGHT_PICTURE = 250  # [grey levels] at or above which a pixel is overexposed
 BRIGHT_QUANTILE = 0.95  # of the values, below that of the brightest twentieth
 OVEREXPOSED_SHARE = 0.7  # of the field
+POINTED_AT_SHARE = 0.25  # of `minimum_confidence`, which suffices where a person has clicked
 REFRESH_EVERY = 30  # images of a track between measurements of the tissue's warmth: white balance drifts
 
 
@@ -117,6 +118,8 @@ class GapSearch:
             if refusal.status is EdgeStatus.NO_GAP:
                 self._evidence.add(stamp_ns, np.nan_to_num(self.confidence))
             raise
+        if clicked is not None:
+            return found
         confidence = self._evidence.add(stamp_ns, self.confidence)
         if confidence < self.parameters.minimum_confidence:
             raise NoPointsError(
@@ -151,11 +154,12 @@ class GapSearch:
         confidence = self.confidence = gap_confidence(
             section, field.extent, light, small, dark, scale, pointed_at=clicked is not None
         )
-        if confidence < self.parameters.minimum_confidence:
+        needed = self.parameters.minimum_confidence * (1.0 if clicked is None else POINTED_AT_SHARE)
+        if confidence < needed:
             raise NoPointsError(
                 EdgeStatus.NO_GAP,
                 f"the dark part is shaded tissue rather than a gap: confidence {confidence:.2f}, needed is "
-                f"{self.parameters.minimum_confidence:.2f}",
+                f"{needed:.2f}",
             )
         return Found(section, foreign, instruments, scale)
 
