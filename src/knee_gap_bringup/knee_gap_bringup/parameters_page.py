@@ -7,14 +7,15 @@ from math import isnan
 from typing import Any
 
 from knee_gap_bringup.leg_control import LegParameters
+from knee_gap_core.node.lifecycle_parameters import LifecycleParameters
 from knee_gap_perception.edge_tracking.parameters import TransportParameters
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters
 from knee_gap_replay.pipeline import PARAMETERS
 
 NODES: dict[str, tuple[type, ...]] = {
-    **PARAMETERS,
-    "segmentation_node": (TransportParameters, *PARAMETERS["segmentation_node"]),
-    "tracking_node": (FrameParameters, *PARAMETERS["tracking_node"]),
+    "segmentation_node": (LifecycleParameters, TransportParameters, *PARAMETERS["segmentation_node"]),
+    "tracking_node": (LifecycleParameters, FrameParameters, *PARAMETERS["tracking_node"]),
+    "uncertainty_node": (LifecycleParameters, *PARAMETERS["uncertainty_node"]),
     "leg_controller_node": (LegParameters,),
 }
 

@@ -78,6 +78,8 @@ class TrackingNode(WiredNode):
     def publish_polled(self) -> None:
         """Publish the lens pose of each new frame, or log why there is none."""
         for frame in self.core.poll(SOURCE_WAIT):
+            if not self.is_active:
+                continue  # the source is kept alive, and what it received is not used
             with self._one_at_a_time:
                 self.publish(self.core.take_frame(frame))
 

@@ -56,6 +56,9 @@ class GuardedNode(Node):
         self._faults_logged: set[str] = set()
         super().__init__(name)
 
+    def start(self) -> None:
+        """Begin to work; called once all is set up."""
+
     def recover(self, fault: Fault) -> None:
         """Reset the core after a fault, and answer what it refused; a node that has a core does so."""
 
@@ -222,6 +225,7 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
         executor = new_executor()
         executor.add_node(node)
+        node.start()
         node.get_logger().info("ready")
         spin(executor)
     except (KeyboardInterrupt, ExternalShutdownException):

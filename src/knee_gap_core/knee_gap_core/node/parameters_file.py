@@ -13,7 +13,15 @@ _PARAMETERS = "ros__parameters"
 _EVERY_NODE = frozenset({"*", "**"})
 # What every node, or the shell around a core, takes beside the core's own parameters.
 _NOT_OF_CORES = frozenset(
-    {"use_sim_time", "image_transport", "max_image_lag", "picture_rate", "publish_tf", "body_frame_id"}
+    {
+        "use_sim_time",
+        "image_transport",
+        "max_image_lag",
+        "picture_rate",
+        "publish_tf",
+        "body_frame_id",
+        "autostart",
+    }
 )
 
 
