@@ -27,6 +27,8 @@ ROUND = np.hypot(COLUMNS - 159.5, ROWS - 89.5) < 86.0
 FIELD = FieldOfView((639.5, 359.5), 344.0, (0.0, 0.0, 1279.0, 719.0))
 SCALE = 0.25
 NOTHING = np.zeros((180, 320), np.float32)
+NO = np.zeros((180, 320), bool)
+NONE = (NO, NO)
 # A slit near the rim, wider than high.
 SLIT = (np.abs(ROWS - 40) < 8) & (np.abs(COLUMNS - 160) < 40)
 REGION = (np.array([639.5, 359.5]), 330.0)
@@ -94,9 +96,13 @@ def test_specks_are_no_opening_and_an_instrument_is_not_part_of_one() -> None:
     gap[100:103, 100:103] = 0.9
     made = NOTHING.copy()
     made[:, 178:184] = 0.8
-    seen = learned_gap(Classes(gap, made, NOTHING), ROUND)
+    metal = NO.copy()
+    metal[:, 140:143] = True
+    seen = learned_gap(Classes(gap, made, NOTHING), ROUND, (metal, NO))
     assert not seen.opening[95:110].any()
-    assert seen.opening[40, 130:170].all()
+    assert seen.opening[40, 145:170].all()
+    assert not seen.opening[:, 140:143].any()
+    assert seen.instruments[40, 140:143].all()
     assert not seen.opening[:, 176:186].any()
     assert seen.instruments[40, 176:186].all()
 
@@ -106,19 +112,31 @@ def test_the_confidence_of_a_section_follows_the_shares_in_it() -> None:
     found = []
     for share in (0.6, 0.9):
         gap = np.where(SLIT, np.float32(share), np.float32(0.02))
-        seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND)
+        seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND, NONE)
         section, confidence = next(learned_sections(seen, value, FIELD, SCALE, REGION))
         assert abs(section.centre[1] / 4 - 40) < 3
         assert abs(section.across[1]) > 0.9
         found.append(confidence)
     assert 0.0 < found[0] < found[1] < 1.0
-    nothing = learned_gap(Classes(NOTHING, NOTHING, NOTHING), ROUND)
+    nothing = learned_gap(Classes(NOTHING, NOTHING, NOTHING), ROUND, NONE)
     assert not list(learned_sections(nothing, value, FIELD, SCALE, REGION))
+
+
+def test_a_dark_part_beside_one_as_dark_is_hardly_an_opening() -> None:
+    gap = np.where(SLIT, np.float32(0.9), np.float32(0.02))
+    seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND, NONE)
+    below = ROWS > 40
+    found = []
+    for upper, lower in ((120, 120), (120, 42)):
+        value = np.where(SLIT, 40, np.where(below, lower, upper)).astype(np.uint8)
+        found.append(next(learned_sections(seen, value, FIELD, SCALE, REGION))[1])
+    assert found[0] > 0.9
+    assert found[1] < 0.1
 
 
 def test_more_sections_lie_apart_along_the_opening() -> None:
     gap = np.where(SLIT, np.float32(0.9), np.float32(0.02))
-    seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND)
+    seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND, NONE)
     value = np.full((180, 320), 120, np.uint8)
     centres = [section.centre / 4 for section, _ in learned_sections(seen, value, FIELD, SCALE, REGION)]
     assert 2 <= len(centres) <= 4
@@ -128,7 +146,7 @@ def test_more_sections_lie_apart_along_the_opening() -> None:
 
 def test_points_are_chosen_beside_an_opening_whose_wall_is_as_bright_as_the_tissue() -> None:
     gap = np.where(SLIT, np.float32(0.9), np.float32(0.02))
-    seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND)
+    seen = learned_gap(Classes(gap, NOTHING, NOTHING), ROUND, NONE)
     value = np.full((180, 320), 120, np.uint8)
     section, _ = next(learned_sections(seen, value, FIELD, SCALE, REGION))
     grey = np.ascontiguousarray(_tissue()[..., 1])

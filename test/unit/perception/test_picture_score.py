@@ -6,10 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from bench_real_pictures import main
+from bench_real_pictures import main, network_without
 from drawn_joint import Joint
 
 from knee_gap_core.values.arrays import Array, Image
+from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.evaluation.picture_score import field_errors, mean, score_picture
 from knee_gap_perception.image.field_of_view import FieldOfView
 from knee_gap_perception.marks.marked_picture import Decision, MarkedField, MarkedPicture, Region
@@ -74,6 +75,15 @@ def test_a_field_is_right_where_it_is_the_marked_one() -> None:
     full = field_errors(MarkedField(box=box), FieldOfView((640.0, 360.0), np.inf, box), shape)
     assert full[0] == 1.0
     assert np.isnan(full[1])
+
+
+def test_a_source_is_scored_by_the_network_that_has_not_seen_it(tmp_path: Path) -> None:
+    for name in ("learned", "without_a", "without_b+c"):
+        (tmp_path / f"{name}.onnx").touch()
+    assert network_without(tmp_path, "a").name == "without_a.onnx"
+    assert network_without(tmp_path, "c").name == "without_b+c.onnx"
+    with pytest.raises(PerceptionError, match="no network that was trained without the source 'learned'"):
+        network_without(tmp_path, "learned")
 
 
 def test_the_mean_leaves_out_what_is_not_known() -> None:

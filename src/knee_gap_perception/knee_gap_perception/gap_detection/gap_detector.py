@@ -14,7 +14,7 @@ from knee_gap_perception.gap_detection.confidence import gap_confidence
 from knee_gap_perception.gap_detection.confidence_filter import ConfidenceFilter
 from knee_gap_perception.gap_detection.cross_section import Section, find_section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
-from knee_gap_perception.gap_detection.learned_gap import REACH, learned_gap, learned_sections
+from knee_gap_perception.gap_detection.learned_gap import WIDER, learned_gap, learned_sections
 from knee_gap_perception.image.field_of_view import FieldOfView, brightness
 from knee_gap_perception.image.instruments_and_glare import (
     USUAL_LIMIT,
@@ -81,7 +81,8 @@ class GapSearch:
         small, scale = self._smaller(picture)
         inside = field.mask((small.shape[0], small.shape[1]), scale)
         if isinstance(self._segmentation, Learned):
-            dark = learned_gap(self._segmentation.classes(small, inside), inside).opening
+            foreign_now = metal_and_glare(small, least_warmth(picture))
+            dark = learned_gap(self._segmentation.classes(small, inside), inside, foreign_now).opening
         else:
             foreign, *_ = self._foreign(picture, small, brightness(small), field, scale)
             dark = self._segmentation(small, inside & ~foreign)
@@ -176,11 +177,12 @@ class GapSearch:
         shape, value = (small.shape[0], small.shape[1]), brightness(small)
         scale = min(1.0, self.parameters.working_rows / min(picture.shape[:2]))
         whole = field.mask(shape, scale)
-        seen = learned_gap(network.classes(small, whole), whole)
-        glare = seen.glare | metal_and_glare(small, least_warmth(picture))[1]
+        seen = learned_gap(
+            network.classes(small, whole), whole, metal_and_glare(small, least_warmth(picture))
+        )
         centre, radius = self._region(field, clicked)
         if clicked is None:
-            radius = max(radius, REACH * field.extent)
+            radius *= WIDER
         sections = learned_sections(seen, value, field, scale, (centre, radius))
         first = next(sections, None)
         if first is None:
@@ -198,7 +200,7 @@ class GapSearch:
             for other, confidence in sections
             if confidence >= least and _width(other, camera) >= self.parameters.minimum_width
         )
-        foreign = seen.instruments | glare
+        foreign = seen.instruments | seen.glare
         return Found(section, foreign, seen.instruments, scale, seen.opening, others)
 
     def _check_width(self, section: Section, camera: Camera, what: str) -> None:

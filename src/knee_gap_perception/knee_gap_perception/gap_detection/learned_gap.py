@@ -21,9 +21,12 @@ MADE = 0.35  # [-] probability from which a pixel shows an instrument: a point o
 GLARE = 0.5  # [-]
 SMALLEST = 0.004  # of the field's area: less is not an opening that one can look through
 SECTIONS = 4  # that are tried along an opening, where beside the first ones no points can be chosen
-REACH = 0.92  # of the field's radius, within which the middle of a section may lie
-# Logistic calibration of the network's mean log odds in the section's disc.
-CALIBRATION = (0.0, 1.0)
+WIDER = 1.65  # times the radius of the region of interest: the network judges up to near the rim as well
+# The network takes a dark organ beside a pale one for an opening: on its darker side there is hardly a step.
+# Both numbers were chosen by looking at sections of pictures that the network had not seen.
+CONTRAST_WEIGHT = 4.0  # of the logarithm of the lesser contrast, relative to
+USUAL_CONTRAST = 0.3
+LEAST_CONTRAST = 0.05  # [-] limit: lower values carry no further information
 CERTAIN = 0.999  # [-] upper limit of a pixel's probability
 
 
@@ -36,10 +39,14 @@ class LearnedGap(NamedTuple):
     glare: Mask
 
 
-def learned_gap(classes: Classes, field: Mask) -> LearnedGap:
-    """Masks of the opening, of instruments and of glare within a field (h, w)."""
-    made = _grown(field & (classes.instrument > MADE), 2)
-    glare = field & (classes.glare > GLARE)
+def learned_gap(classes: Classes, field: Mask, metal_and_glare: tuple[Mask, Mask]) -> LearnedGap:
+    """Masks of the opening, of instruments and of glare within a field (h, w).
+
+    `metal_and_glare` (h, w) are those that colour shows; they count as well.
+    """
+    metal, clipped = metal_and_glare
+    made = _grown(field & (classes.instrument > MADE), 2) | (field & metal)
+    glare = field & ((classes.glare > GLARE) | clipped)
     opening = field & (classes.gap > GAP) & ~made
     return LearnedGap(classes.gap, _without_specks(opening, SMALLEST * float(field.sum())), made, glare)
 
@@ -63,12 +70,13 @@ def learned_sections(
 
 
 def section_confidence(gap: npt.NDArray[np.float32], section: Section, scale: float) -> float:
-    """Confidence [0, 1] in a section, from the probabilities (h, w) in its disc."""
+    """Confidence [0, 1] in a section, from the probabilities (h, w) in its disc and its lesser contrast."""
     disc = _disc(gap.shape, (section.centre + 0.5) * scale - 0.5, max(section.radius * scale, 1.0))
     share = np.clip(gap[disc], 1.0 - CERTAIN, CERTAIN)
     odds = float(np.log(share / (1.0 - share)).mean())
-    offset, slope = CALIBRATION
-    return float(1.0 / (1.0 + np.exp(-(offset + slope * odds))))
+    contrast = max(float(section.contrast.min()), LEAST_CONTRAST)
+    odds += CONTRAST_WEIGHT * float(np.log(contrast / USUAL_CONTRAST))
+    return float(1.0 / (1.0 + np.exp(-odds)))
 
 
 def _disc(shape: tuple[int, ...], centre: Array, radius: float) -> Mask:
