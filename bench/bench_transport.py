@@ -2,8 +2,8 @@
 
 A bag is played in real time; every image should give one gap_edges. Latency is from the moment a recorder
 receives the image's camera_info, which is played with it, to the moment it receives the edges. With --all the
-two other nodes run as well, and the poses of the lens guide the search. Without a bag the sample is played
-forwards and backwards for as long as asked.
+two other nodes run as well, and the poses of the lens guide the search; with --suite all in one process.
+Without a bag the sample is played forwards and backwards for as long as asked.
 """
 
 import argparse
@@ -32,6 +32,7 @@ NODES = {
     "tracking_node": "knee_gap_perception",
     "uncertainty_node": "knee_gap_uncertainty",
 }
+SUITE = "suite_node"
 
 
 class Run(NamedTuple):
@@ -50,6 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("bag", type=Path, nargs="?", help="bag to play; without it the sample, to and fro")
     parser.add_argument("--seconds", type=float, default=10.0, help="of the sample, to and fro")
     parser.add_argument("--all", action="store_true", help="tracking_node and uncertainty_node as well")
+    parser.add_argument("--suite", action="store_true", help="all three nodes in one process (suite_node)")
     parser.add_argument("--domain", type=int, default=77, help="ROS_DOMAIN_ID")
     asked = parser.parse_args(argv)
     try:
@@ -57,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             bag = asked.bag or to_and_fro(Path(folder) / "bag", asked.seconds)
             floor = run(bag, Path(folder) / "floor", asked.domain, ["floor"])
             nodes = list(NODES) if asked.all else ["segmentation_node"]
+            nodes = [SUITE] if asked.suite else nodes
             full = run(bag, Path(folder) / "nodes", asked.domain, nodes)
     except (BagError, StartError, OSError) as error:
         print(f"bench_transport: {error}", file=sys.stderr)
@@ -107,7 +110,8 @@ def run(bag: Path, out: Path, domain: int, nodes: Sequence[str]) -> Run:
             processes.start(node, command(node, bag))
         processes.wait_ready(nodes, 120.0)
         before = {name: cpu_seconds(processes.pid(name)) for name in [*nodes, "record"]}
-        topics = [IMAGE, CAMERA_INFO, *([BODY_POSE] if "tracking_node" in nodes else [])]
+        tracks = "tracking_node" in nodes or SUITE in nodes
+        topics = [IMAGE, CAMERA_INFO, *([BODY_POSE] if tracks else [])]
         play = [executable("knee_gap_replay", "play"), str(bag), "--topics", *topics, "--delay", "1"]
         processes.start("play", [*play, "--wait-for", *topics])
         if processes.wait("play") != 0:
@@ -125,7 +129,7 @@ def command(node: str, bag: Path) -> list[str]:
     if node == "floor":
         floor = str(Path(__file__).with_name("decode_only.py"))
         return [sys.executable, floor, "--ros-args", "-r", "__ns:=/knee_gap"]
-    started = [executable(NODES[node], node), "--ros-args", "-r", "__ns:=/knee_gap"]
+    started = [executable(NODES.get(node, "knee_gap_bringup"), node), "--ros-args", "-r", "__ns:=/knee_gap"]
     if node == "segmentation_node":
         started += ["-p", "image_transport:=compressed"]
     if node != "uncertainty_node":

@@ -27,6 +27,7 @@ setup(
             "leg_controller_node = knee_gap_bringup.entry_points:leg_controller_node",
             "live = knee_gap_bringup.entry_points:live",
             "replay = knee_gap_bringup.entry_points:replay",
+            "suite_node = knee_gap_bringup.entry_points:suite_node",
         ],
     },
 )

@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 
 from knee_gap_core.node.base_node import RESULT_QOS, run
 from knee_gap_core.node.errors import ConfigurationError
+from knee_gap_core.node.local_topics import LocalSubscription
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_core.node.wiring import Health, Output
@@ -64,6 +65,7 @@ class SegmentationNode(WiredNode):
         self._is_auto = transport.image_transport == "auto"
         self.subscribe_to_images("raw" if self._is_auto else transport.image_transport)
         self.publish(self.core.begin(self.now_ns()))
+        self._publish_more = self.one_at_a_time(self.guarded("image", self.publish_ready))
         # Runs while an image waits for its pose, so that it does not wait too long.
         self._patience = self.create_timer(max(self.core.longest_wait, 0.001), self.publish_ready)
         self._patience.cancel()
@@ -110,13 +112,19 @@ class SegmentationNode(WiredNode):
         self.publish(self.core.take(IMAGES[self._transport].topic, message, self.now_ns()))
 
     def publish_ready(self) -> None:
-        """Publish the edges of the images that are ready, and the pictures that have subscribers."""
+        """Publish the edges of the next image that is ready, and the pictures that have subscribers.
+
+        More images have their turn after whatever else has arrived: a busy machine must not starve the poses.
+        """
         self.take_waiting()
         for one in self.core.ready(self.now_ns()):
             self.publish([one])
             if isinstance(one, Output):
                 self.take_waiting()
                 self.publish_pictures()
+                if self.core.stream.waiting:
+                    self.executor.create_task(self._publish_more)
+                break
         self.set_patience()
 
     def publish_pictures(self) -> None:
@@ -157,6 +165,8 @@ class SegmentationNode(WiredNode):
 
     def take_all(self, subscription: Any, handle: Callable[[Any], None]) -> None:
         """Handle the messages that wait in a subscription, each with its info."""
+        if isinstance(subscription, LocalSubscription):
+            return  # nothing waits in it
         with subscription.handle:
             while (taken := subscription.handle.take_message(subscription.msg_type, False)) is not None:
                 handle(taken)

@@ -14,6 +14,7 @@ from rclpy.task import Future
 from threadpoolctl import threadpool_limits
 
 from knee_gap_core.node.errors import ConfigurationError
+from knee_gap_core.node.local_topics import LocalPublisher, LocalTopics
 from knee_gap_core.node.parameters import as_rows, declare, refuse_unknown, refused_by_ros, require_files
 from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.node.wiring import Health
@@ -48,7 +49,12 @@ EVENTS = ("deadline", "incompatible_qos", "liveliness", "message_lost", "incompa
 
 
 class GuardedNode(Node):
-    """A node that no message ends: whatever a callback raises is refused, counted and logged at its seam."""
+    """A node that no message ends: whatever a callback raises is refused, counted and logged at its seam.
+
+    `local`: topics between the nodes of this process, set before they are made.
+    """
+
+    local: LocalTopics | None = None
 
     def __init__(self, name: str) -> None:
         # Before rclpy's own subscriptions and services, which are guarded as well.
@@ -71,6 +77,9 @@ class GuardedNode(Node):
             if (handler := getattr(events, event, None)) is not None:
                 setattr(events, event, self.guarded(f"{event} of {topic}", handler))
         guarded = self.guarded(f"message on {topic}", callback)
+        if self.local is not None and (name := self.resolve_topic_name(topic)) in self.local.names:
+            return self.local.subscribe(name, guarded)
+        guarded = self.one_at_a_time(guarded)
 
         @functools.wraps(callback)
         def taken(*arguments: Any) -> None:
@@ -85,7 +94,8 @@ class GuardedNode(Node):
     ) -> Any:
         """Start a timer as rclpy does, with a guarded callback."""
         what = f"call of {getattr(callback, '__name__', 'a timer')}"
-        return super().create_timer(timer_period_sec, self.guarded(what, callback), *options, **named)
+        guarded = self.one_at_a_time(self.guarded(what, callback))
+        return super().create_timer(timer_period_sec, guarded, *options, **named)
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], *options: Any, **named: Any
@@ -99,8 +109,28 @@ class GuardedNode(Node):
                     setattr(response, field, fault.reason)
             return response
 
-        guarded = self.seam.guarded(f"request of {srv_name}", answer, callback)
+        guarded = self.one_at_a_time(self.seam.guarded(f"request of {srv_name}", answer, callback))
         return super().create_service(srv_type, srv_name, guarded, *options, **named)
+
+    def create_publisher(self, msg_type: Any, topic: str, *options: Any, **named: Any) -> Any:
+        """Publish as rclpy does, and to the nodes of this process directly."""
+        publisher = super().create_publisher(msg_type, topic, *options, **named)
+        if self.local is None or (name := self.resolve_topic_name(topic)) not in self.local.names:
+            return publisher
+        return LocalPublisher(publisher, self.local, name)
+
+    def one_at_a_time(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """A callback that waits while another thread calls into a node of this process."""
+        if self.local is None:
+            return callback
+        lock = self.local.lock
+
+        @functools.wraps(callback)
+        def alone(*arguments: Any) -> Any:
+            with lock:
+                return callback(*arguments)
+
+        return alone
 
     def guarded(self, what: str, callback: Callable[..., None]) -> Callable[..., None]:
         """A callback that raises nothing: what it would raise refuses `what`, and the core is reset."""
@@ -211,6 +241,11 @@ def spin(executor: Any) -> None:
 
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     """Start a node, spin until it is stopped, return the exit code: 2 for a mistake of the user's."""
+    return run_all([make_node], argv)
+
+
+def run_all(make_nodes: Sequence[Callable[[], Any]], argv: Sequence[str] | None = None) -> int:
+    """As `run`, with all nodes in one executor."""
     try:
         require_files(sys.argv if argv is None else argv)
         rclpy.init(args=None if argv is None else list(argv))
@@ -219,14 +254,18 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         return 2
     # The matrices here are small: threads of the linear algebra would spin for a second core and win nothing.
     threadpool_limits(1)
-    node = executor = None
+    executor = None
+    nodes: list[Any] = []
     try:
-        node = make_node()
+        for make_node in make_nodes:
+            nodes.append(make_node())
         # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
         executor = new_executor()
-        executor.add_node(node)
-        node.start()
-        node.get_logger().info("ready")
+        for node in nodes:
+            executor.add_node(node)
+        for node in nodes:
+            node.start()
+            node.get_logger().info("ready")
         spin(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -242,7 +281,7 @@ def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
         if executor is not None:
             # Before what the middleware would call is gone.
             executor.shutdown()
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

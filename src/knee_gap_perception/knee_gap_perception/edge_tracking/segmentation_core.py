@@ -144,10 +144,10 @@ class SegmentationCore:
         message = fill_gap_edges(
             self._blank(GAP_EDGES.msgtype), edges, lambda: self._blank("knee_gap_msgs/msg/GapSection")
         )
-        reported: list[Outcome] = [Output(GAP_EDGES.topic, message, edges.stamp_ns)]
+        edges_output = Output(GAP_EDGES.topic, message, edges.stamp_ns)
         if reason := self.stream.reason:
-            reported.append(Notice(edges.status.name, f"{edges.status.name}: {reason}"))
-        return reported
+            return [Notice(edges.status.name, f"{edges.status.name}: {reason}"), edges_output]
+        return [edges_output]
 
 
 def _filled(message: Any, picture: Image, encoding: str) -> Any:
