@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from knee_gap_core.bag.message_types import blank
+from knee_gap_core.conversions.edge_messages import edges_from_message, fill_gap_edges
+from knee_gap_core.conversions.pose_messages import fill_lens_pose, lens_pose_from_message
 from knee_gap_core.values.arrays import Array
-from knee_gap_core.values.edge_messages import edges_from_message, fill_gap_edges
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
-from knee_gap_core.values.pose_messages import fill_lens_pose, lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera import bearing_jacobian
 from knee_gap_perception.camera.models import FisheyeCamera

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import rclpy
 from sensor_msgs.msg import CompressedImage
 
-from knee_gap_core.node.base_node import IMAGE_QOS, RESULT_QOS, BaseNode, run
+from knee_gap_core.live.base_node import IMAGE_QOS, RESULT_QOS, BaseNode, run
 from knee_gap_msgs.msg import GapEdges
 from knee_gap_perception.messages import image_from_compressed
 

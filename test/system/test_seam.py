@@ -20,7 +20,7 @@ NODE = """
 import sys
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
-from knee_gap_core.node.base_node import RESULT_QOS, BaseNode, run
+from knee_gap_core.live.base_node import RESULT_QOS, BaseNode, run
 
 class RootNode(BaseNode):
     def __init__(self):

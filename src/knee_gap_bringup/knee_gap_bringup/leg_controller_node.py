@@ -12,7 +12,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from knee_gap_bringup.leg_control import TICK, Action, Command, Estimate, LegControl, LegParameters, hold
-from knee_gap_core.node.base_node import RESULT_QOS, BaseNode, run
+from knee_gap_core.live.base_node import RESULT_QOS, BaseNode, run
 from knee_gap_msgs.msg import GapEstimate
 
 # Frame of the command: its x axis is the direction in which the joint opens.

@@ -7,7 +7,7 @@ from math import isnan
 from typing import Any
 
 from knee_gap_bringup.leg_control import LegParameters
-from knee_gap_core.node.lifecycle_parameters import LifecycleParameters
+from knee_gap_core.live.lifecycle_parameters import LifecycleParameters
 from knee_gap_perception.edge_tracking.parameters import TransportParameters
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters
 from knee_gap_replay.pipeline import PARAMETERS

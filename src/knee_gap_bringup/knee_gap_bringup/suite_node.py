@@ -10,8 +10,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from knee_gap_core.node.base_node import GuardedNode, run_all
-from knee_gap_core.node.local_topics import LocalTopics
+from knee_gap_core.live.base_node import GuardedNode, run_all
+from knee_gap_core.live.local_topics import LocalTopics
 from knee_gap_perception.segmentation_node import SegmentationNode
 from knee_gap_perception.tracking_node import TrackingNode
 from knee_gap_uncertainty.uncertainty_node import UncertaintyNode

@@ -5,8 +5,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from knee_gap_core.conversions.pose_messages import lens_pose_from_message
 from knee_gap_core.values.arrays import Image
-from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.poses import FARTHEST, LensPose, is_unit
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.image.encodings import decoded

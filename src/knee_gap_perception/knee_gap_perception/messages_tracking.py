@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from knee_gap_core.values.pose_messages import fill_header
+from knee_gap_core.conversions.pose_messages import fill_header
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.calibration.calibration import Calibration

@@ -10,11 +10,11 @@ from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
 from std_srvs.srv import Trigger
 
-from knee_gap_core.node.base_node import RESULT_QOS, run
+from knee_gap_core.live.base_node import RESULT_QOS, run
+from knee_gap_core.live.local_topics import LocalSubscription
+from knee_gap_core.live.wired_node import WiredNode, blank
 from knee_gap_core.node.errors import ConfigurationError
-from knee_gap_core.node.local_topics import LocalSubscription
 from knee_gap_core.node.seam import Fault
-from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_core.node.wiring import Health, Output
 from knee_gap_msgs.srv import ChoosePoint
 from knee_gap_perception.edge_tracking.parameters import TransportParameters

@@ -6,10 +6,10 @@ from functools import partial
 from typing import Any
 
 from knee_gap_core.bag.errors import BagError
-from knee_gap_core.node.base_node import run
+from knee_gap_core.live.base_node import run
+from knee_gap_core.live.wired_node import WiredNode, blank
 from knee_gap_core.node.errors import ConfigurationError
 from knee_gap_core.node.seam import Fault
-from knee_gap_core.node.wired_node import WiredNode, blank
 from knee_gap_core.node.wiring import Health
 from knee_gap_core.values import quaternions
 from knee_gap_perception.errors import PerceptionError

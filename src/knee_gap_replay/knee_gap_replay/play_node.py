@@ -24,7 +24,7 @@ from knee_gap_core.bag import qos as qos_profiles
 from knee_gap_core.bag.bag import BagMessage, BagReader, Topic
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.bag.message_types import check_type_hash, message_class
-from knee_gap_core.node.base_node import GuardedNode
+from knee_gap_core.live.base_node import GuardedNode
 from knee_gap_core.node.command_line import (
     Parser,
     not_negative,

@@ -26,7 +26,7 @@ from knee_gap_core.bag.message_types import known_type, message_class
 from knee_gap_core.bag.qos import PROFILES
 from knee_gap_core.bag.writing.bag_writer import Split
 from knee_gap_core.bag.writing.mcap_storage import COMPRESSIONS
-from knee_gap_core.node.base_node import GuardedNode
+from knee_gap_core.live.base_node import GuardedNode
 from knee_gap_core.node.command_line import Parser, positive, run, stop_on_signals
 from knee_gap_core.node.parameters import refuse_unknown, refused_by_ros, require_files
 from knee_gap_replay.recording import WriterThread

@@ -8,8 +8,8 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 
-from knee_gap_core.node.base_node import run
-from knee_gap_core.node.wired_node import WiredNode, blank
+from knee_gap_core.live.base_node import run
+from knee_gap_core.live.wired_node import WiredNode, blank
 from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimation.uncertainty_core import (
     GAP_EDGES,

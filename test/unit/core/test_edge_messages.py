@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knee_gap_core.bag.message_types import blank
-from knee_gap_core.values.edge_messages import edges_from_message, fill_gap_edges
+from knee_gap_core.conversions.edge_messages import edges_from_message, fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 
 

@@ -2,7 +2,7 @@
 
 import threading
 
-from knee_gap_core.node.local_topics import LocalPublisher, LocalTopics
+from knee_gap_core.live.local_topics import LocalPublisher, LocalTopics
 
 
 class Middleware:

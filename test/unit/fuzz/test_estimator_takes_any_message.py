@@ -10,10 +10,10 @@ from hostile import BEGIN, SETTINGS, header, hurt, numbers, poses, sequences, st
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knee_gap_core.values.edge_messages import edges_from_message
+from knee_gap_core.conversions.edge_messages import edges_from_message
+from knee_gap_core.conversions.pose_messages import lens_pose_from_message
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
-from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimation import messages
 from knee_gap_uncertainty.estimation.estimator import GapEstimator

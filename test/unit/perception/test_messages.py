@@ -8,8 +8,8 @@ import numpy.typing as npt
 import pytest
 from plain_messages import header
 
+from knee_gap_core.conversions.edge_messages import fill_gap_edges
 from knee_gap_core.values.arrays import Image
-from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges
 from knee_gap_core.values.stamps import stamp_ns
 from knee_gap_perception.errors import PerceptionError

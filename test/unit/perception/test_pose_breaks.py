@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from plain_messages import bgr_image, header, pose
 
+from knee_gap_core.conversions.pose_messages import fill_lens_pose
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
-from knee_gap_core.values.pose_messages import fill_lens_pose
 from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import PoseParameters

@@ -8,7 +8,7 @@ from plain_messages import header, pose
 from scipy.spatial.transform import Rotation
 from tracked_hand import AT_BODY, PERIOD_NS, START_NS, hand_motion, moved, reasons
 
-from knee_gap_core.values.pose_messages import body_pose_from_message, fill_lens_pose, fill_transform
+from knee_gap_core.conversions.pose_messages import body_pose_from_message, fill_lens_pose, fill_transform
 from knee_gap_core.values.poses import BodyPose, FramePose, LensPose, rigid_transform
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_pose.pose_validity import RefusalReason, ValidityParameters

@@ -8,7 +8,7 @@ import pytest
 
 from knee_gap_core.bag.bag import BagReader, BagWriter
 from knee_gap_core.bag.message_types import blank
-from knee_gap_core.values.edge_messages import fill_gap_edges
+from knee_gap_core.conversions.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rigid_transforms import from_rotation_vectors, inverse, rigid

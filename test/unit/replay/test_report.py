@@ -15,7 +15,7 @@ import pytest
 
 from knee_gap_core.bag.bag import BagWriter
 from knee_gap_core.bag.message_types import blank
-from knee_gap_core.values.edge_messages import fill_gap_edges
+from knee_gap_core.conversions.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.rejection import Rejection

@@ -5,10 +5,10 @@ from typing import Any, Self
 
 import numpy as np
 
+from knee_gap_core.conversions.edge_messages import fill_gap_edges
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
 from knee_gap_core.values.arrays import Image
-from knee_gap_core.values.edge_messages import fill_gap_edges
 from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.stamps import set_stamp
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none

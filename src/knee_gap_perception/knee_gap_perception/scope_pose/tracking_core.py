@@ -4,9 +4,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
+from knee_gap_core.conversions.pose_messages import fill_lens_pose, fill_transform
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
-from knee_gap_core.values.pose_messages import fill_lens_pose, fill_transform
 from knee_gap_core.values.poses import BodyPose, FramePose, LensPose
 from knee_gap_perception.calibration.in_use import CalibrationParameters, hash_or_none
 from knee_gap_perception.camera.medium import Medium

@@ -11,9 +11,9 @@ import numpy as np
 
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.conversions.pose_messages import body_pose_from_message
 from knee_gap_core.node.arguments import Parser, finite
 from knee_gap_core.values.errors import KneeGapError
-from knee_gap_core.values.pose_messages import body_pose_from_message
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_perception.calibrate.bag_input import opened
 from knee_gap_perception.errors import PerceptionError

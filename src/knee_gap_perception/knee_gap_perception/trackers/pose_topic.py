@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from knee_gap_core.conversions.pose_messages import body_pose_from_message
 from knee_gap_core.values.pose_interpolation import body_between
-from knee_gap_core.values.pose_messages import body_pose_from_message
 from knee_gap_core.values.poses import BodyPose, is_place, is_unit
 from knee_gap_perception.trackers.body_source import BodyFrame, SourceStatus, Subscription
 from knee_gap_perception.trackers.up_axis import position_z_up, quaternion_z_up

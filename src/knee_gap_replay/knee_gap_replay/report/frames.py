@@ -10,8 +10,8 @@ import numpy as np
 
 from knee_gap_core.bag.bag import BagMessage, BagReader
 from knee_gap_core.bag.errors import BagError
+from knee_gap_core.conversions.edge_messages import edges_from_message
 from knee_gap_core.values.arrays import Array, Image
-from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.gap_estimate import GapStatus
 from knee_gap_perception.edge_tracking.overlay import draw_overlay

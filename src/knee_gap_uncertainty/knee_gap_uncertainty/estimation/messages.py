@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from knee_gap_core.conversions.pose_messages import body_pose_from_message
 from knee_gap_core.values.gap_estimate import GapEstimate
-from knee_gap_core.values.pose_messages import body_pose_from_message
 from knee_gap_core.values.poses import LensPose
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_uncertainty.inputs.scope_rotations import ScopeRotation

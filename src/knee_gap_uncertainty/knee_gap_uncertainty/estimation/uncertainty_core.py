@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from knee_gap_core.conversions.edge_messages import edges_from_message
+from knee_gap_core.conversions.pose_messages import lens_pose_from_message
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Blank, Health, InputTopic, Notice, Outcome, Output, OutputTopic, Qos
-from knee_gap_core.values.edge_messages import edges_from_message
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
-from knee_gap_core.values.pose_messages import lens_pose_from_message
 from knee_gap_core.values.stamps import NANOSECONDS
 from knee_gap_uncertainty.estimation import messages
 from knee_gap_uncertainty.estimation.acceptance import Reason

@@ -7,8 +7,8 @@ from typing import Any
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from knee_gap_core.node.base_node import BaseNode
-from knee_gap_core.node.lifecycle_parameters import LifecycleParameters
+from knee_gap_core.live.base_node import BaseNode
+from knee_gap_core.live.lifecycle_parameters import LifecycleParameters
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Health
 

@@ -8,8 +8,8 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 
 from knee_gap_core.bag.message_types import message_class
-from knee_gap_core.node.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS
-from knee_gap_core.node.managed_node import ManagedNode
+from knee_gap_core.live.base_node import IMAGE_QOS, LATCHED_QOS, RESULT_QOS, TRACKER_QOS
+from knee_gap_core.live.managed_node import ManagedNode
 from knee_gap_core.node.seam import Fault
 from knee_gap_core.node.wiring import Health, InputTopic, NodeCore, Notice, Outcome, OutputTopic, Qos
 

@@ -13,8 +13,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.task import Future
 from threadpoolctl import threadpool_limits
 
+from knee_gap_core.live.local_topics import LocalPublisher, LocalTopics
 from knee_gap_core.node.errors import ConfigurationError
-from knee_gap_core.node.local_topics import LocalPublisher, LocalTopics
 from knee_gap_core.node.parameters import as_rows, declare, refuse_unknown, refused_by_ros, require_files
 from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.node.wiring import Health

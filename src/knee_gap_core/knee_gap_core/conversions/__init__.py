@@ -1,0 +1,1 @@
+"""Conversion of values from and to messages."""
