@@ -1,6 +1,7 @@
 """The base of every node: parameters, QoS by purpose, diagnostics, and one way to start and to stop."""
 
 import functools
+import gc
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -263,6 +264,9 @@ def run_all(make_nodes: Sequence[Callable[[], Any]], argv: Sequence[str] | None 
         executor = new_executor()
         for node in nodes:
             executor.add_node(node)
+        # All that stands by now stays. To look through it again for garbage takes longer than an image may.
+        gc.collect()
+        gc.freeze()
         for node in nodes:
             node.start()
             node.get_logger().info("ready")
