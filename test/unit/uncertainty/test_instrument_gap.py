@@ -276,6 +276,10 @@ def test_points_that_are_not_beside_their_edges_are_refused():
     scene = some_cylinders(np.random.default_rng(2))
     opening, ranges = opening_of(bearings(scene.points), scene.edges), np.linalg.norm(scene.points, axis=1)
     assert "far from its edge" in flaw_of(opening._replace(insets=np.array([0.03, 0.3])), ranges, 0.01)
+    # The same angle is farther from the edge where the tissue is farther from the lens.
+    turned = opening._replace(insets=np.array([0.03, 0.08]))
+    assert flaw_of(turned, np.array([0.012, 0.012]), 0.01) == ""
+    assert "far from its edge" in flaw_of(turned, np.array([0.024, 0.021]), 0.01)
     assert "different distances" in flaw_of(opening, ranges * [1.0, 4.0], 0.01)
     assert flaw_of(opening, np.array([np.nan, 0.01]), 0.01) == ""
 

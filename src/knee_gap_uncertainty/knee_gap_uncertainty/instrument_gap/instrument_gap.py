@@ -53,6 +53,9 @@ ROUGHNESS_BOUND = 0.12e-3
 # Angle [rad] by which a point may lie beyond its edge, and ratio of the points' distances. Beyond them it
 # is not on the tissue that ends at its edge, but on something before or behind it.
 MOST_INSET = 0.2
+# Distance [m] of a point from the line of sight along its edge. The surface between them is one of the shapes
+# above only if it is short: beyond this, the edge of a knee of meshes was 12 mm deeper than its point.
+MOST_BESIDE = 1.2e-3
 MOST_RATIO = 2.5
 LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad]
 
@@ -126,7 +129,8 @@ def flaw_of(opening: Opening, ranges: Array, inside: float) -> str:
         return "the edges do not enclose an opening"
     if not (opening.insets > -inside).all():
         return "a tracked point lies inside the opening"
-    if not (opening.insets < MOST_INSET).all():
+    beside = np.where(np.isfinite(ranges), ranges, 0.0) * np.sin(opening.insets)
+    if not ((opening.insets < MOST_INSET) & (beside < MOST_BESIDE)).all():
         return "a tracked point lies too far from its edge"
     if np.isfinite(ranges).all() and not ranges.max() < MOST_RATIO * ranges.min():
         return "the two sides of the opening lie at too different distances"
