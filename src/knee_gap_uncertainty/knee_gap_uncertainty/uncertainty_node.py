@@ -64,9 +64,10 @@ class UncertaintyNode(WiredNode):
 
     def check_sequence(self, topic: str, info: Mapping[str, int | None]) -> None:
         """End the track if a message does not continue those before, as with two publishers of a topic."""
-        if not self._sequences[topic].continues(info.get("publication_sequence_number")):
+        number = info.get("publication_sequence_number")
+        if not self._sequences[topic].continues(number, time.monotonic()):
             self.core.estimator.break_input(topic)
-            words = "two nodes publish it, it was started again, or messages were lost"
+            words = "two nodes publish it, or it was started again"
             self.log_once(f"sequence of {topic}", f"the messages of {topic} have a break: {words}")
 
     def queued_ns(self, info: Mapping[str, int | None]) -> int:

@@ -8,9 +8,9 @@ import pytest
 from knee_gap_uncertainty.inputs.message_sequence import MessageSequence
 
 
-def breaks(numbers: list[int | None]) -> list[bool]:
+def breaks(numbers: list[int | None], period: float = 0.008) -> list[bool]:
     sequence = MessageSequence()
-    return [not sequence.continues(number) for number in numbers]
+    return [not sequence.continues(number, 50.0 + k * period) for k, number in enumerate(numbers)]
 
 
 def test_one_publisher_has_no_break_wherever_it_is_heard_from() -> None:
@@ -18,7 +18,13 @@ def test_one_publisher_has_no_break_wherever_it_is_heard_from() -> None:
     assert not any(breaks(list(range(700, 750))))
 
 
-def test_a_publisher_started_again_and_lost_messages_are_one_break_each() -> None:
+def test_what_a_full_queue_lost_while_the_subscriber_stood_still_is_no_break() -> None:
+    assert not any(breaks([5, 6, 90, 91], period=0.31))
+    # A publisher that was started again meanwhile is one all the same.
+    assert breaks([5, 6, 1, 2], period=0.31) == [False, False, True, False]
+
+
+def test_a_publisher_started_again_and_a_jump_ahead_are_one_break_each() -> None:
     assert breaks([5, 6, 1, 2, 3]) == [False, False, True, False, False]
     assert breaks([5, 6, 9, 10]) == [False, False, True, False]
     assert breaks([5, 5]) == [False, True]

@@ -1,1 +1,1 @@
-"""Nodes and commands without ROS: wiring of cores, parameters and their rules, command lines, start and stop."""
+"""Nodes and commands without ROS: wiring of cores, parameters and their rules, command lines."""
