@@ -71,6 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="no Dice, only decisions, on such joints",
     )
     parser.add_argument(
+        "--decided-by", choices=WITHOUT_NETWORK, help="strategy of --decision; else the default"
+    )
+    parser.add_argument(
         "--at", type=float, help="share of the travel at which they are looked at; else each seed has its own"
     )
     parser.add_argument("--pictures", type=Path, help="folder for pictures of wrong decisions")
@@ -96,7 +99,7 @@ def decisions(asked: argparse.Namespace) -> list[Judged]:
                 direction = directions[seed % len(directions)]
                 frames = []
                 for frame, camera in rendered_one(level, seed, direction, asked, is_open=kind == "open"):
-                    frames.append(judge(frame, camera))
+                    frames.append(judge(frame, camera, asked.decided_by))
                     if asked.pictures and frames[-1].found != (kind == "open"):
                         keep_picture(asked.pictures, f"{kind}_{level}_{seed}_{frame.index}", frame, camera)
                 joints += [frames] if frames else []
@@ -200,19 +203,20 @@ def dice_of(frame: SimulatorFrame, camera: Camera, parameters: EdgeParameters) -
     return float(2 * (mask & truth).sum() / max(mask.sum() + truth.sum(), 1))
 
 
-def judge(frame: SimulatorFrame, camera: Camera) -> Judged:
-    """Decide on a frame by itself, and compare with its truth."""
-    confidence, found = decide(frame.image, camera)
-    detector = GapEdgeTracker(replace(EdgeParameters(), minimum_confidence=0.0))
+def judge(frame: SimulatorFrame, camera: Camera, strategy: str | None = None) -> Judged:
+    """Decide on a frame by itself, by a strategy or the default one, and compare with its truth."""
+    parameters = EdgeParameters() if strategy is None else EdgeParameters(segmentation=strategy)
+    confidence, found = decide(frame.image, camera, parameters)
+    detector = GapEdgeTracker(replace(parameters, minimum_confidence=0.0))
     edges = detector.process(0, frame.image, camera)
     middle = np.rint(edges.pixels.mean(axis=0)) if edges.status is EdgeStatus.VALID else None
     is_gap = middle is not None and bool(frame.gap_mask[int(middle[1]), int(middle[0])])
     return Judged(confidence, is_gap, found)
 
 
-def decide(image: Image, camera: Camera) -> tuple[float, bool]:
+def decide(image: Image, camera: Camera, parameters: EdgeParameters | None = None) -> tuple[float, bool]:
     """Confidence of the best section of a picture, and whether points were chosen."""
-    detector = GapEdgeTracker()
+    detector = GapEdgeTracker(parameters)
     edges = detector.process(0, image, camera)
     return detector.confidence, edges.status is EdgeStatus.VALID
 
