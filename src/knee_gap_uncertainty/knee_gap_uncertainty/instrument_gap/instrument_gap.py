@@ -54,7 +54,7 @@ ROUGHNESS_BOUND = 0.12e-3
 # is not on the tissue that ends at its edge, but on something before or behind it.
 MOST_INSET = 0.2
 # Distance [m] of a point from the line of sight along its edge. The surface between them is one of the shapes
-# above only if it is short: beyond this, the edge of a knee of meshes was 12 mm deeper than its point.
+# above only if it is short: beyond this, edges beside the notch of a knee of meshes were far deeper.
 MOST_BESIDE = 1.2e-3
 MOST_RATIO = 2.5
 LEAST_HALF, MOST_HALF = 0.002, np.radians(60.0)  # half angle of an opening [rad]
