@@ -66,8 +66,10 @@ def measured(bag: Path, folder: Path) -> Comparison:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a line for each bag."""
     parser = argparse.ArgumentParser(prog="bench_gap", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("bags", nargs="+", type=Path)
+    parser.add_argument("bags", nargs="*", type=Path)
     asked = parser.parse_args(argv)
+    if not asked.bags:
+        print("bench_gap: no bags are named: nothing is measured")
     for bag in tqdm(asked.bags, disable=not sys.stderr.isatty()):
         with tempfile.TemporaryDirectory() as folder:
             try:
