@@ -88,7 +88,7 @@ def test_without_its_second_body_the_turn_is_not_known() -> None:
     ("parameters", "calibration", "words"),
     [
         ({"body_to_shaft_translation": (0.0, 0.0, 0.2)}, SCOPE, "body_to_shaft_translation: leave one"),
-        ({"oblique_angle": 0.1}, SCOPE, "so do oblique_angle"),
+        ({"oblique_angle": 0.1}, SCOPE, "and in oblique_angle"),
         ({"scope_rotation_body": "post"}, None, "needs a calibration_file"),
         ({"scope_rotation_body": "post"}, SCOPE, "knows no second body"),
         ({}, TURNED, "name it in scope_rotation_body"),
