@@ -15,7 +15,7 @@ from knee_gap_core.bag.bag import BagReader
 from knee_gap_simulation.recordings.recording import IMAGE
 
 GAP = "/knee_gap/gap"
-# What still fits on the disk once it is said to be full [bytes].
+# Free space on the disk when the fault begins [bytes].
 LEFT = 300_000
 SAID = ("recording goes on in memory", "there is space again")
 

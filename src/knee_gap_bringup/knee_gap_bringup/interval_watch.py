@@ -1,4 +1,4 @@
-"""Whether the interval of a track still narrows, so that waiting tells more than opening the joint."""
+"""Detection of an interval that still narrows: while it does, the leg waits before it opens further."""
 
 # By which fraction an interval must be narrower than the narrowest before it, to count.
 NARROWER = 0.05

@@ -59,7 +59,7 @@ _MOST_WAITING_BYTES = 512 << 20
 class Block(NamedTuple):
     """A record that holds messages: a chunk, or a single message of a file without chunks.
 
-    `channels` are those of its messages, None if the file does not tell.
+    `channels` are those of its messages, None if the file does not state them.
     """
 
     start_ns: int

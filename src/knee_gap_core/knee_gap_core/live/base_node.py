@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
 from threadpoolctl import threadpool_limits
 
 from knee_gap_core.live.local_topics import LocalPublisher, LocalTopics
@@ -21,8 +20,6 @@ from knee_gap_core.node.seam import Fault, Seam
 from knee_gap_core.node.wiring import Health
 
 Parameters = TypeVar("Parameters")
-
-LONGEST_SPIN = 3600.0  # [s] without a look whether ROS is shut down
 
 # Images: whatever the camera offers, and never a growing queue of old ones. Eight hold 133 ms at 60 Hz, which
 # a two-core machine needs to lose nothing when another process takes its turn.
@@ -75,15 +72,7 @@ class GuardedNode(Node):
         guarded = self.guarded(f"message on {topic}", callback)
         if self.local is not None and (name := self.resolve_topic_name(topic)) in self.local.names:
             return self.local.subscribe(name, guarded)
-        guarded = self.one_at_a_time(guarded)
-
-        @functools.wraps(callback)
-        def taken(*arguments: Any) -> None:
-            # EventsExecutor hands over a message and what is known of it as one tuple.
-            one_tuple = len(arguments) == 1 and isinstance(arguments[0], tuple)
-            guarded(*arguments[0] if one_tuple else arguments)
-
-        return super().create_subscription(msg_type, topic, taken, *options, **named)
+        return super().create_subscription(msg_type, topic, self.one_at_a_time(guarded), *options, **named)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], None], *options: Any, **named: Any
@@ -218,23 +207,6 @@ def _is_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def new_executor() -> Any:
-    """The executor of a node.
-
-    Not rclpy's EventsExecutor, which costs a third as much a message: with it segmentation_node now and then
-    took its first image before the poses that had arrived with it.
-    """
-    return SingleThreadedExecutor()
-
-
-def spin(executor: Any) -> None:
-    """Spin until ROS is shut down."""
-    never = Future()
-    while rclpy.ok():
-        # Not its `spin`: built for an old C library, it looks at the clock without a pause.
-        executor.spin_until_future_complete(never, timeout_sec=LONGEST_SPIN)
-
-
 def run(make_node: Callable[[], Any], argv: Sequence[str] | None = None) -> int:
     """Start a node, spin until it is stopped, return the exit code: 2 for a mistake of the user's."""
     return run_all([make_node], argv)
@@ -256,7 +228,7 @@ def run_all(make_nodes: Sequence[Callable[[], Any]], argv: Sequence[str] | None 
         for make_node in make_nodes:
             nodes.append(make_node())
         # One executor for the whole run: rclpy.spin_once builds and tears one down at every call.
-        executor = new_executor()
+        executor = SingleThreadedExecutor()
         for node in nodes:
             executor.add_node(node)
         # All that stands by now stays. To look through it again for garbage takes longer than an image may.
@@ -265,7 +237,7 @@ def run_all(make_nodes: Sequence[Callable[[], Any]], argv: Sequence[str] | None 
         for node in nodes:
             node.start()
             node.get_logger().info("ready")
-        spin(executor)
+        executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ConfigurationError as error:

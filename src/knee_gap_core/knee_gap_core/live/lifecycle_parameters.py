@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class LifecycleParameters:
-    """Whether a node waits for somebody who manages it."""
+    """Whether a node activates itself."""
 
     autostart: bool = field(
         default=True,
         metadata={
-            "description": "Configure and activate the node at its start; false leaves that to whoever calls "
+            "description": "Configure and activate the node at its start; false leaves that to the caller of "
             "change_state"
         },
     )

@@ -21,7 +21,7 @@ class LocalTopics:
     """Hands messages of some topics, given by their full names, to the subscriptions of this process.
 
     A message that is published while another is handed over waits for its turn, so that no callback runs
-    inside of another. `lock` is held meanwhile; whoever calls into a node from elsewhere holds it as well.
+    inside of another. `lock` is held meanwhile; a thread that calls into a node from elsewhere holds it too.
     """
 
     def __init__(self, names: Iterable[str]) -> None:

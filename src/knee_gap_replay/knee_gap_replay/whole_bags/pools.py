@@ -89,7 +89,7 @@ class ProcessPool:
 
 def _work(bag: str, job: Job, connection: Connection) -> None:
     """Process one bag in a process of its own, and send how it went."""
-    # Nobody to tell any more, or an end from outside: the state then says that the bag was begun. Bars of
+    # No parent process any more, or an interrupt: the state then records that the bag was begun. Bars of
     # several bags would overwrite each other.
     with (
         contextlib.suppress(BrokenPipeError, KeyboardInterrupt),

@@ -16,7 +16,7 @@ from knee_gap_uncertainty.numerics.small_matrix import cholesky, solve_factored
 from knee_gap_uncertainty.numerics.vectors import Vector, cross, dot, norm, row, scale, subtract, unit, vector
 
 PASSES = 3  # of Gauss and Newton: a degree of turn is not small beside a tenth of it
-EXPECTED_DEPTH, DEPTH_SIGMA = 0.012, 0.02  # [m] of points, while the views do not tell it
+EXPECTED_DEPTH, DEPTH_SIGMA = 0.012, 0.02  # [m] of points, while the views do not determine it
 # Of the noise of a bearing: what a calibration does below that is not worth a fit.
 NEGLIGIBLE = 0.2
 
@@ -26,7 +26,7 @@ class SharedViews(NamedTuple):
 
     `lens` (N, 3) [m], `bearings` (N, 2, 3), `rotations` (N, 3, 3) of the calibrated lens, `motions` (N, 6),
     `camera_errors` (N, 2, 3, k); `image_variances` (N, 2), `lens_variances` (N,) and `rotation_variances`
-    (N,) are those of an axis. Shifts are told from `rotation` (3, 3), `motion` (6,) of one view, at which
+    (N,) are those of an axis. Shifts are measured from `rotation` (3, 3), `motion` (6,) of one view, at which
     they are none: what moves all lenses alike moves the points with them.
     """
 
@@ -43,7 +43,7 @@ class SharedViews(NamedTuple):
 
 
 def shared_views(views: Views, rotation: Array | None = None, motion: Array | None = None) -> SharedViews:
-    """What the loops need of views; shifts are told from the last, unless from another one."""
+    """What the loops need of views; shifts are measured from the last, unless from another one."""
     rotations = np.ascontiguousarray(views.calibrated_rotations)
     motions = np.zeros((len(views), 6)) if views.lens_motions is None else views.lens_motions
     camera = np.zeros((len(views), 2, 3, 0)) if views.camera_errors is None else views.camera_errors
