@@ -70,29 +70,28 @@ class Judged:
 @pytest.mark.parametrize(
     ("fault", "reason", "words"),
     [
-        (["--freeze-every", "3.3", "--freeze-for", "0.8"], "frozen", "the driver is frozen"),
-        (["--swap-every", "3.3", "--swap-for", "0.8"], "swapped", "calls 'tibia' by the name of the body"),
-        (["--jump-every", "3.3", "--jump-for", "0.8"], "jump", "a jump"),
-        (["--occlude-every", "3.3", "--occlude-for", "0.8"], "not_tracked", "does not see the body"),
+        (["--freeze-every", "3.3", "--freeze-for", "0.8"], "frozen", ["the driver is frozen"]),
+        (["--swap-every", "3.3", "--swap-for", "0.8"], "swapped", ["calls 'tibia' by the name of the body"]),
+        (["--jump-every", "3.3", "--jump-for", "0.8"], "jump", ["a jump", "has not come back"]),
+        (["--occlude-every", "3.3", "--occlude-for", "0.8"], "not_tracked", ["does not see the body"]),
     ],
     ids=["frozen", "swapped", "jump", "occluded"],
 )
 def test_what_is_no_measurement_is_not_published(
-    fault: list[str], reason: str, words: str, tmp_path: Path
+    fault: list[str], reason: str, words: list[str], tmp_path: Path
 ) -> None:
     with Processes(tmp_path, ENVIRONMENT) as processes, Client(DOMAIN) as client:
         judged = Judged(processes, client, *fault)
 
-        def walked() -> bool:
-            return len(judged.poses) > 4 * RATE and bool(judged.words()) and judged.refused(reason) > RATE
+        def reported() -> bool:
+            return any("rejected:" in one and any(word in one for word in words) for one in judged.words())
 
-        client.spin_until(walked, timeout=40.0)
+        def walked() -> bool:
+            return len(judged.poses) > 4 * RATE and reported() and judged.refused(reason) > RATE
+
+        # Diagnostics come once a second: not every fault of 0.8 s is in one of them.
+        client.spin_until(walked, timeout=60.0)
         assert max(distance_from_truth(pose) for pose in judged.poses) < CLOSE
-        reported = [one for one in judged.words() if "rejected:" in one]
-        assert reported
-        if reason == "jump":
-            words = "has not come back" if not any(words in one for one in reported) else words
-        assert any(words in one for one in reported)
         assert processes.end("tracking_node") == 0
 
 
