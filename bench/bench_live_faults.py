@@ -119,9 +119,6 @@ class Room:
         sent = sorted(
             (one for each in self.script for one in fault.change(each)), key=lambda one: (one.due, one.stamp)
         )
-        for known in self.heard.values():
-            known.clear()
-        self.forged.clear()
         with contextlib.ExitStack() as stack:
             disk = stack.enter_context(FullDisk(self.processes, self.logs)) if fault.fills_disk else None
             self.client.spin(2.0)
@@ -131,6 +128,10 @@ class Room:
 
     def _play_with(self, fault: Fault, sent: list[Sent], disk: FullDisk | None) -> dict[int, int]:
         """Play; return the stamps in the bag of the images, by the stamps with which they were sent [ns]."""
+        # What was heard while nothing was played is timed by the row before.
+        for known in self.heard.values():
+            known.clear()
+        self.forged.clear()
         self.began, offset_ns = time.monotonic(), time.time_ns()
         self.fault, self.second = fault, self.outlet(fault.second) if fault.second else None
         player = threading.Thread(target=self._play, args=(sent, offset_ns))

@@ -79,7 +79,8 @@ class EstimatorParameters:
     max_pose_wait: float = field(
         default=0.02,
         metadata={
-            "description": "how long an image waits for the lens pose after it before tracking is lost [s]",
+            "description": "how long an image waits for the lens pose after it, while poses come, before "
+            "tracking is lost [s]",
             "range": (0.0, 1.0),
         },
     )

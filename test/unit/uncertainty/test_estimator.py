@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tilted_scope import EXACT, FRAME_NS, MS, POINTS, TILT, TRAVEL, TRUE_GAP, edges, pose, run
 
-from knee_gap_core.values.edges import EdgeStatus, GapEdges
 from knee_gap_core.values.errors import MeasurementError
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
@@ -16,49 +16,6 @@ from knee_gap_uncertainty.estimation.estimator import GapEstimator
 from knee_gap_uncertainty.estimator_parameters import EXACT_SCOPE, EstimatorParameters
 from knee_gap_uncertainty.inputs.pose_buffer import PoseRefusal
 from knee_gap_uncertainty.two_view.gap_range import gap_range
-
-EXACT = EstimatorParameters(**EXACT_SCOPE)
-
-MS = 1_000_000
-FRAME_NS = 16_666_667
-POINTS = np.array([[0.001, 0.0, 0.012], [-0.002, 0.003, 0.012]])
-TRUE_GAP = float(np.linalg.norm(POINTS[1] - POINTS[0]))
-# In steps that a hand can make between two images.
-TRAVEL = [float(x) for x in np.linspace(0.0, 0.006, 13)]
-TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
-
-
-def pose(stamp_ns: int, x: float, frame_id: str = "world") -> LensPose:
-    return LensPose(
-        stamp_ns=stamp_ns,
-        frame_id=frame_id,
-        position=np.array([x, 0.0, 0.0]),
-        quaternion_xyzw=TILT.as_quat(),
-        covariance=np.diag([1e-12] * 6),
-    )
-
-
-def edges(stamp_ns: int, x: float, track_id: int = 1, usable: bool = True) -> GapEdges:
-    towards = TILT.inv().apply(POINTS - [x, 0.0, 0.0])
-    bearings = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    sigma = np.radians(0.1)
-    covariances = sigma**2 * (np.eye(3) - bearings[:, :, None] * bearings[:, None, :])
-    seen = GapEdges.of_points(stamp_ns, track_id, bearings, covariances, angular_error=np.radians(0.3))
-    status = EdgeStatus.VALID if usable else EdgeStatus.UNKNOWN
-    return replace(seen.with_rims_at_points(), status=status)
-
-
-def run(
-    estimator: GapEstimator, positions: list[float], track_id: int = 1, begin: int = 10**9
-) -> list[GapEstimate]:
-    """Images at 60 Hz with a pose 1 ms before and after each."""
-    estimates = []
-    for k, x in enumerate(positions):
-        stamp = begin + k * FRAME_NS
-        estimates += estimator.add_pose(pose(stamp - MS, x), stamp)
-        estimates += estimator.add_edges(edges(stamp, x, track_id), stamp + MS)
-        estimates += estimator.add_pose(pose(stamp + MS, x), stamp + 2 * MS)
-    return estimates
 
 
 def test_one_estimate_an_image_and_exact_for_exact_views() -> None:
@@ -114,27 +71,6 @@ def test_without_travel_nothing_is_valid_and_no_gap_is_told() -> None:
     for estimate in run(GapEstimator(EXACT), [1e-12 * k for k in range(30)]):
         assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
         assert math.isnan(estimate.gap)
-
-
-def test_image_waits_for_the_pose_after_it_and_is_never_extrapolated() -> None:
-    estimator = GapEstimator(EXACT)
-    estimator.add_pose(pose(10**9 - MS, 0.0), 10**9)
-    assert estimator.add_edges(edges(10**9, 0.0), 10**9) == []
-    assert estimator.advance(10**9 + 15 * MS) == []
-    (estimate,) = estimator.add_pose(pose(10**9 + MS, 0.0), 10**9 + 16 * MS)
-    assert estimate.status is GapStatus.INSUFFICIENT_PARALLAX
-
-
-def test_tracking_lost_within_the_wait_and_said_once_an_image() -> None:
-    estimator = GapEstimator(EXACT)
-    run(estimator, list(np.linspace(0.0, 0.006, 30)))
-    stamp = 10**9 + 30 * FRAME_NS
-    assert estimator.add_edges(edges(stamp, 0.006), stamp) == []
-    (estimate,) = estimator.advance(stamp + 21 * MS)
-    assert estimate.status is GapStatus.TRACKING_LOST
-    assert math.isnan(estimate.gap)
-    assert math.isnan(estimate.gap_min)
-    assert estimator.advance(stamp + 22 * MS) == []
 
 
 def test_poses_too_far_from_the_image_are_out_of_sync() -> None:

@@ -12,7 +12,7 @@ def after_images(interval_ns: int, count: int = 12) -> tuple[Silence, int]:
     """A watch that has seen images at an interval, and the time of the last."""
     silence = Silence(MARGIN)
     for index in range(count):
-        silence.add_image(index * interval_ns, index * interval_ns)
+        silence.add(index * interval_ns, index * interval_ns)
     return silence, (count - 1) * interval_ns
 
 
@@ -32,7 +32,7 @@ def test_a_missing_image_is_reported_within_its_interval_and_the_margin(rate: in
 
 def test_the_first_interval_is_taken_for_the_longest() -> None:
     silence = Silence(MARGIN)
-    silence.add_image(0, 0)
+    silence.add(0, 0)
     assert not silence.is_due(100 * MS)
     assert silence.is_due(101 * MS)
 
@@ -52,11 +52,11 @@ def test_silence_is_repeated_at_the_margin() -> None:
 
 def test_one_lost_image_does_not_change_the_usual_interval() -> None:
     silence, last = after_images(16 * MS)
-    silence.add_image(last + 48 * MS, last + 48 * MS)
+    silence.add(last + 48 * MS, last + 48 * MS)
     assert silence.is_due(last + (48 + 16 + 31) * MS)
 
 
 def test_stamps_that_run_backwards_begin_again() -> None:
     silence, last = after_images(16 * MS)
-    silence.add_image(0, last + 16 * MS)
+    silence.add(0, last + 16 * MS)
     assert not silence.is_due(last + (16 + 99) * MS)

@@ -43,7 +43,7 @@ class PoseParameters:
     """How the pose of the lens is waited for. Raises PerceptionError for values outside their range."""
 
     max_pose_wait: float = field(
-        default=0.03,
+        default=0.02,
         metadata={
             "description": "How long an image waits for the lens pose after it; 0: not at all [s]",
             "range": (0.0, 0.1),

@@ -35,6 +35,9 @@ from knee_gap_uncertainty.scope_calibration.scope_calibration import (
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
+# Edges that lay in a queue for longer were not taken promptly: poses may lie in a queue as well, and are taken
+# within the second time.
+PROMPT_NS, QUEUES_NS = 2_000_000, 4_000_000
 # Of calibrations: what arrives from a network must not grow without end.
 MOST_NODES = 8
 # Advice, and profiles, that nobody has taken yet.
@@ -42,11 +45,15 @@ MOST_ADVICE = 16
 
 
 class Pending(NamedTuple):
-    """Edges that wait for the lens pose after them, when they arrived [ns], and why they cannot be used."""
+    """Edges that wait for the lens pose after them, when they arrived [ns], and why they cannot be used.
+
+    `queued`: they had lain in a queue, and poses may lie in one.
+    """
 
     edges: GapEdges
     arrival_ns: int
     flaw: str = ""
+    queued: bool = False
 
 
 class GapEstimator:
@@ -87,6 +94,7 @@ class GapEstimator:
         self._delays = DelayFloor()
         self._last_edges: Pending | None = None
         self._silence = Silence(self.parameters.max_edges_silence)
+        self._pose_silence = Silence(self.parameters.max_pose_wait)
         self._now_ns = 0
 
     @property
@@ -107,6 +115,7 @@ class GapEstimator:
             delay_ns = arrival_ns - queued_ns - pose.stamp_ns
             near = abs(delay_ns) <= self.parameters.max_clock_offset * NANOSECONDS
             self._delays.take(delay_ns, arrival_ns, is_live=self._is_live and near)
+            self._pose_silence.add(pose.stamp_ns, arrival_ns)
         return self._resolve(arrival_ns)
 
     def add_rotation(self, reported: ScopeRotation, arrival_ns: int) -> list[GapEstimate]:
@@ -146,8 +155,8 @@ class GapEstimator:
             # Views by another calibration are not comparable with those before.
             self._track = None
 
-    def add_edges(self, edges: GapEdges, arrival_ns: int) -> list[GapEstimate]:
-        """Take the edges of one image; return the estimates that are ready."""
+    def add_edges(self, edges: GapEdges, arrival_ns: int, queued_ns: int = 0) -> list[GapEstimate]:
+        """Take the edges of one image, which had lain in a queue; return the estimates that are ready."""
         self._turn_clock(arrival_ns)
         last = self._last_edges
         if last is not None and edges.stamp_ns == last.edges.stamp_ns:
@@ -160,11 +169,11 @@ class GapEstimator:
             self._delays.clear()
             self._track = None
         self._last_edges = Pending(edges, arrival_ns)
-        self._silence.add_image(edges.stamp_ns, arrival_ns)
+        self._silence.add(edges.stamp_ns, arrival_ns)
         if len(self._pending) == MOST_PENDING:
             self.counts["images dropped while waiting for poses"] += 1
             self._pending.popleft()
-        self._pending.append(Pending(edges, arrival_ns, edges.flaw()))
+        self._pending.append(Pending(edges, arrival_ns, edges.flaw(), queued_ns > PROMPT_NS))
         return self._resolve(arrival_ns)
 
     def advance(self, now_ns: int, advice_pieces: int = PIECES) -> list[GapEstimate]:
@@ -241,6 +250,7 @@ class GapEstimator:
             self.counts["clock ran backwards"] += 1
             self._pending.clear()
             self._delays.clear()
+            self._pose_silence.restart(now_ns)
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
                 self._silence.restart(now_ns)
@@ -270,7 +280,7 @@ class GapEstimator:
             turn=self._turns.at(edges.stamp_ns) if self._rotation_is_followed() else 0.0,
         )
         awaited = facts.pose is PoseRefusal.NOT_YET or facts.turn is RotationRefusal.NOT_YET
-        may_wait = now_ns - pending.arrival_ns <= self.parameters.max_pose_wait * NANOSECONDS
+        may_wait = now_ns - pending.arrival_ns <= self._longest_wait_ns(pending, now_ns)
         if awaited and may_wait and not facts.edges_flaw:
             return None
         if verdict := judge(facts):
@@ -278,6 +288,12 @@ class GapEstimator:
         assert isinstance(facts.pose, LensPose)
         assert not isinstance(facts.turn, RotationRefusal)
         return self._measure(facts, edges, replace(facts.pose, scope_rotation=facts.turn))
+
+    def _longest_wait_ns(self, pending: Pending, now_ns: int) -> float:
+        """How long edges may wait for their pose [ns]: poses that do not come any more are not awaited."""
+        if self._pose_silence.is_due(now_ns):
+            return QUEUES_NS if pending.queued else -1.0
+        return self.parameters.max_pose_wait * NANOSECONDS
 
     def _rotation_is_followed(self) -> bool:
         """Whether the rotation of the scope in its camera head is reported, or announced."""

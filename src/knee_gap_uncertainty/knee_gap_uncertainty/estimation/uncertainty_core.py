@@ -75,7 +75,8 @@ class UncertaintyCore:
         """Receive a message; return the estimates that it made possible."""
         estimator = self.estimator
         if topic == GAP_EDGES.topic:
-            return list(self._published(estimator.add_edges(edges_from_message(message), now_ns)))
+            edges = edges_from_message(message)
+            return list(self._published(estimator.add_edges(edges, now_ns, queued_ns)))
         if topic == SCOPE_POSE.topic:
             pose = lens_pose_from_message(message)
             return list(self._published(estimator.add_pose(pose, now_ns, queued_ns)))

@@ -1,21 +1,21 @@
-"""When images have been missing for too long: longer than the camera's own interval and a margin."""
+"""When messages have been missing for too long: longer than their own interval and a margin."""
 
 from collections import deque
 from statistics import median
 
 from knee_gap_core.values.stamps import NANOSECONDS
 
-# Intervals between images from which the usual one is found.
+# Intervals between messages from which the usual one is found.
 INTERVALS = 9
-# Longest interval that counts as usual [s], and the usual one before two images have come. A silence must be
+# Longest interval that counts as usual [s], and the usual one before two messages have come. A silence must be
 # reported before a subscriber's deadline of 0.1 s, give or take a tick.
 LONGEST_INTERVAL = 0.07
 
 
 class Silence:
-    """Watches for missing images; repeated silence is reported every `margin`.
+    """Watches for missing messages; repeated silence is reported every `margin`.
 
-    `margin` [s]: how much longer than the usual interval between images one may be missing.
+    `margin` [s]: how much longer than the usual interval between messages one may be missing.
     """
 
     def __init__(self, margin: float) -> None:
@@ -24,8 +24,8 @@ class Silence:
         self._last_stamp_ns: int | None = None
         self._due_ns = 0
 
-    def add_image(self, stamp_ns: int, now_ns: int) -> None:
-        """Receive an image's stamp [ns]; stamps that ran backwards begin again."""
+    def add(self, stamp_ns: int, now_ns: int) -> None:
+        """Receive a message's stamp [ns]; stamps that ran backwards begin again."""
         if self._last_stamp_ns is not None:
             if stamp_ns > self._last_stamp_ns:
                 self._intervals.append(stamp_ns - self._last_stamp_ns)
@@ -35,7 +35,7 @@ class Silence:
         self.restart(now_ns)
 
     def restart(self, now_ns: int) -> None:
-        """Wait from now [ns] for the next image, as after an image."""
+        """Wait from now [ns] for the next message, as after one."""
         self._due_ns = now_ns + self._usual_ns() + self._margin_ns
 
     def report(self, now_ns: int) -> None:
