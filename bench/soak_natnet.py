@@ -18,7 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from knee_gap_core.values.poses import LensPose
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.trackers.body_source import BodyFrame, choose_body
 from knee_gap_perception.trackers.natnet.client import NatNetClient, NatNetParameters
 from knee_gap_simulation.natnet.scene import CLOCK_SECONDS, TrackedScene

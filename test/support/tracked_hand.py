@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from knee_gap_core.values.poses import BodyPose
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 
 PERIOD_NS = 8_333_333
 START_NS = 1_700_000_000_000_000_000

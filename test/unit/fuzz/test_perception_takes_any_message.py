@@ -23,7 +23,8 @@ from knee_gap_perception.image.encodings import ENCODINGS
 from knee_gap_perception.messages import checked_lens_pose, image_from_message
 from knee_gap_perception.messages_tracking import notch_from_message
 from knee_gap_perception.scope_pose.pose_validity import Refusal
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.scope_rotation.rotated_poses import RotatedPoses, Tracked
 from knee_gap_perception.trackers.body_source import choose_body
 from knee_gap_perception.trackers.pose_topic import PoseTopics

@@ -16,7 +16,7 @@ from knee_gap_perception.calibration.calibration_file import load_calibration, r
 from knee_gap_perception.calibration.in_use import CalibrationParameters
 from knee_gap_perception.camera.intrinsics import Intrinsics
 from knee_gap_perception.errors import PerceptionError
-from knee_gap_perception.scope_pose.scope_tracker import TrackingParameters
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
 
 

@@ -22,7 +22,8 @@ from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.messages_tracking import fill_scope_calibration
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
 from knee_gap_uncertainty.estimation.messages import calibration_from_message
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters

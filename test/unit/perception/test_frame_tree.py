@@ -13,7 +13,8 @@ from knee_gap_perception.calibration.calibration import Calibration, LensOnBody,
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters, FrameTree
 from knee_gap_perception.scope_pose.pose_validity import Refusal
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.scope_rotation.shaft_axis import Mount, ShaftAxis
 
 START_NS, PERIOD_NS = 10**18, 8_333_333

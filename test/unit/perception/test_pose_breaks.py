@@ -15,7 +15,8 @@ from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.parameters import PoseParameters
 from knee_gap_perception.point_tracking.point_tracker import PointTracker
 from knee_gap_perception.scope_pose.pose_validity import RefusalReason, ValidityParameters
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 
 FRAME = 0.05  # [s] between images
 PERIOD = 1 / 120

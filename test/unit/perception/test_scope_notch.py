@@ -19,7 +19,8 @@ from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.image.field_of_view import FieldOfView
 from knee_gap_perception.messages_tracking import fill_scope_notch, fill_scope_rotation, notch_from_message
 from knee_gap_perception.scope_pose.pose_validity import Refusal, RefusalReason
-from knee_gap_perception.scope_pose.scope_tracker import NO_NOTCH_YET, ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import NO_NOTCH_YET, ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.scope_rotation.notch import Notch, NotchShape, common_shape, find_notch, notches_of
 from knee_gap_perception.scope_rotation.notch_border import STEP, STEPS, Border
 from knee_gap_perception.scope_rotation.notch_tracker import (

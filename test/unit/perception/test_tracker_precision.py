@@ -169,7 +169,7 @@ class TestCommand:
     def test_what_it_prints_is_taken_by_the_tracker(self, tmp_path):
         from ruamel.yaml import YAML
 
-        from knee_gap_perception.scope_pose.scope_tracker import TrackingParameters
+        from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 
         write_bag(tmp_path / "bag", recording(1, rest=2.0, motion=3.0))
         assert main([str(tmp_path / "bag"), "--out", str(tmp_path), "--lever", "0", "0", "0.2"]) == 0

@@ -12,7 +12,8 @@ from knee_gap_core.conversions.pose_messages import body_pose_from_message, fill
 from knee_gap_core.values.poses import BodyPose, FramePose, LensPose, rigid_transform
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_pose.pose_validity import RefusalReason, ValidityParameters
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 
 
 class TestLensPose:

@@ -17,8 +17,9 @@ from knee_gap_core.values.edges import EdgeKind, EdgeState, EdgeStatus, GapEdges
 from knee_gap_core.values.stamps import set_stamp, stamp_ns
 from knee_gap_perception.edge_tracking.edge_stream import EdgeStream
 from knee_gap_perception.edge_tracking.segmentation_core import SegmentationCore
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
 from knee_gap_perception.scope_pose.tracking_core import TrackingCore
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.trackers.scope_feed import ScopeFeed
 from knee_gap_replay.pipeline import GapPipeline
 from knee_gap_replay.processing import process

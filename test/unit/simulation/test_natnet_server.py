@@ -11,7 +11,8 @@ from ports import free_port
 from knee_gap_core.values.poses import BodyPose, LensPose
 from knee_gap_perception.errors import PerceptionError
 from knee_gap_perception.scope_pose.pose_validity import RefusalReason
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.trackers.body_source import choose_body
 from knee_gap_perception.trackers.natnet.client import NatNetClient, NatNetParameters
 from knee_gap_perception.trackers.natnet.packets import NatNetVersion, decode_packet

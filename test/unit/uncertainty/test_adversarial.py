@@ -270,8 +270,8 @@ def test_images_that_come_twice_change_nothing() -> None:
     scope, estimator = Scope(np.random.default_rng(3)), GapEstimator(EXACT)
     add_edges = estimator.add_edges
 
-    def twice(edges: GapEdges, arrival_ns: int) -> list[GapEstimate]:
-        return add_edges(edges, arrival_ns) + add_edges(edges, arrival_ns)
+    def twice(edges: GapEdges, arrival_ns: int, queued_ns: int = 0) -> list[GapEstimate]:
+        return add_edges(edges, arrival_ns, queued_ns) + add_edges(edges, arrival_ns, queued_ns)
 
     estimator.add_edges = twice  # type: ignore[method-assign]
     assert [repr(e) for e in scope.estimates(estimator)] == [repr(e) for e in once]

@@ -1,14 +1,13 @@
 """From the images of a scope to the two points of the gap: find it, choose the points, follow them."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import chain
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from knee_gap_core.values.arrays import Array, Image, Mask
+from knee_gap_core.values.arrays import Array, Image
 from knee_gap_core.values.edges import EdgeKind, EdgeStatus, GapEdges, SectionEdges
 from knee_gap_core.values.poses import LensPose
 from knee_gap_perception.camera.camera import Camera, bearing_jacobian
@@ -17,7 +16,12 @@ from knee_gap_perception.gap_detection.cross_section import Section
 from knee_gap_perception.gap_detection.edge_parameters import EdgeParameters
 from knee_gap_perception.gap_detection.gap_detector import Found, GapSearch, NoPointsError, check_light
 from knee_gap_perception.gap_detection.section_edges import SectionEdgeFinder
-from knee_gap_perception.image.field_of_view import FieldOfView, FieldOfViewFinder, why_no_field
+from knee_gap_perception.image.field_of_view import (
+    FieldOfView,
+    FieldOfViewFinder,
+    sparse_inside,
+    why_no_field,
+)
 from knee_gap_perception.point_tracking.point_selection import SurfacePoint, choose_points
 from knee_gap_perception.point_tracking.point_tracker import PointObservation, PointTracker
 from knee_gap_perception.point_tracking.points_beside_opening import points_beside_opening
@@ -324,7 +328,7 @@ class GapEdgeTracker:
 
         The track goes on after a short one, as after a point that was hidden.
         """
-        inside = _sparse_inside(field, (picture.shape[0], picture.shape[1]))
+        inside = sparse_inside(field, (picture.shape[0], picture.shape[1]))
         try:
             blue, green, red = np.moveaxis(picture[8::16, 8::16], 2, 0)
             check_light(np.maximum(np.maximum(blue, green), red)[inside])
@@ -392,10 +396,3 @@ class GapEdgeTracker:
 def _channel(picture: Image, channel: int) -> Image:
     """One channel (h, w) of an image (h, w, 3)."""
     return np.asarray(cv2.extractChannel(picture, channel), np.uint8)
-
-
-@lru_cache(maxsize=4)
-def _sparse_inside(field: FieldOfView, shape: tuple[int, int]) -> Mask:
-    """Which of every 16th pixel of every 16th line, from the 8th on, lie inside the field."""
-    rows, columns = np.mgrid[8 : shape[0] : 16, 8 : shape[1] : 16]
-    return np.asarray(field.depth_inside(np.stack([columns, rows], axis=-1)) > 0)

@@ -17,7 +17,8 @@ from knee_gap_perception.messages_tracking import (
 )
 from knee_gap_perception.scope_pose.frame_tree import FrameParameters, FrameTree
 from knee_gap_perception.scope_pose.pose_validity import Refusal, ValidityParameters
-from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker, TrackingParameters
+from knee_gap_perception.scope_pose.scope_tracker import ScopeTracker
+from knee_gap_perception.scope_pose.tracking_parameters import TrackingParameters
 from knee_gap_perception.trackers.natnet.client import NatNetParameters
 from knee_gap_perception.trackers.scope_feed import ScopeFeed, SourceParameters
 

@@ -35,8 +35,8 @@ from knee_gap_uncertainty.scope_calibration.scope_calibration import (
 
 # The most images that may wait for a pose: at 60 Hz over two seconds, far beyond any allowed wait.
 MOST_PENDING = 128
-# Edges that lay in a queue for longer were not taken promptly: poses may lie in a queue as well, and are taken
-# within the second time.
+# Edges that lay in a queue for longer than the first time were not taken promptly: poses may lie in a queue
+# as well, and are taken within the second.
 PROMPT_NS, QUEUES_NS = 2_000_000, 4_000_000
 # Of calibrations: what arrives from a network must not grow without end.
 MOST_NODES = 8

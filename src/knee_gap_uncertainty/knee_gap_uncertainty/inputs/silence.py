@@ -7,8 +7,8 @@ from knee_gap_core.values.stamps import NANOSECONDS
 
 # Intervals between messages from which the usual one is found.
 INTERVALS = 9
-# Longest interval that counts as usual [s], and the usual one before two messages have come. A silence must be
-# reported before a subscriber's deadline of 0.1 s, give or take a tick.
+# Longest interval that counts as usual [s], and the usual one before two messages have come. A silence must
+# be reported before a subscriber's deadline of 0.1 s, give or take a tick.
 LONGEST_INTERVAL = 0.07
 
 
