@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 
 from knee_gap_core.bag.message_types import message_class
@@ -27,6 +28,10 @@ PROFILES = {
         depth=MOST_LATCHING, reliability=LATCHED_QOS.reliability, durability=LATCHED_QOS.durability
     ),
 }
+
+# The executor asks each handler of events at each message; rclpy makes two for each publisher and subscription.
+NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
+NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 
 _class = cache(message_class)
 
@@ -52,12 +57,16 @@ class WiredNode(ManagedNode):
     def open_outputs(self, topics: Iterable[OutputTopic]) -> None:
         """Make publishers."""
         for topic, msgtype, qos, _ in topics:
-            self._outlets[topic] = self.create_publisher(_class(msgtype), topic, PROFILES[qos])
+            self._outlets[topic] = self.create_publisher(
+                _class(msgtype), topic, PROFILES[qos], event_callbacks=NO_PUBLISHER_EVENTS
+            )
 
     def listen(self, given: InputTopic, callback: Callable[..., None]) -> Any:
         """Subscribe to a topic; report it in log and diagnostics if it is needed and not published."""
+        # Between nodes of the suite QoS agrees; a driver's may not, which is then logged.
+        events = None if given.from_driver else NO_SUBSCRIPTION_EVENTS
         subscription = self.create_subscription(
-            _class(given.msgtype), given.topic, callback, PROFILES[given.qos]
+            _class(given.msgtype), given.topic, callback, PROFILES[given.qos], event_callbacks=events
         )
         if given.needed:
             self.watch_input(given.topic)
