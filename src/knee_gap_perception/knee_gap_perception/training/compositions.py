@@ -21,7 +21,6 @@ _HALF = STORED_SIDE / 2.0
 _ROWS, _COLUMNS = np.mgrid[0:STORED_SIDE, 0:STORED_SIDE].astype(np.float32)
 LIT_WALLS = 0.4  # share of openings with a wall that is lit
 FRAYED = 0.35  # share of openings with a frayed edge
-THREADS, SHAFTS = 0.2, 0.5  # shares of the instruments that are drawn; the others are cups
 INK = ((200, 90, 30), (40, 40, 40), (235, 235, 235), (60, 150, 60), (150, 60, 120), (180, 160, 40))
 STEEL = ((18, 18, 20), (45, 45, 45), (95, 95, 95), (150, 150, 150), (200, 200, 195), (120, 130, 165))
 
@@ -76,11 +75,7 @@ def with_instrument(rng: np.random.Generator, example: Example, others: Sequence
     """An example with an instrument: drawn, or cut out of one of the others."""
     if others and rng.random() < 0.4:
         return _pasted(rng, example, others[rng.integers(len(others))])
-    kind = rng.random()
-    if kind < THREADS:
-        cover, colour = _thread(rng)
-    else:
-        cover, colour = _shaft(rng, example) if kind < THREADS + SHAFTS else _cup(rng, example)
+    cover, colour = _thread(rng) if rng.random() < 0.25 else _shaft(rng, example)
     cover = cover * (example.labels != PixelClass.OUTSIDE)
     image = example.image * (1.0 - cover[..., None]) + colour * cover[..., None]
     return _covered(example, image, cover > 0.5)
@@ -130,36 +125,6 @@ def _shaft(rng: np.random.Generator, example: Example) -> tuple[Plane, Plane]:
     if rng.random() < 0.3:  # rings and marks along the shaft
         rings = np.sin(along * rng.uniform(0.2, 0.9)) > rng.uniform(0.3, 0.9)
         colour = colour * (1.0 - 0.6 * rings[..., None])
-    soft = rng.uniform(0.8, 3.0)
-    return np.clip(0.5 + inside / soft, 0.0, 1.0), np.clip(colour, 0.0, 255.0)
-
-
-def _cup(rng: np.random.Generator, example: Example) -> tuple[Plane, Plane]:
-    """Cover (side, side) and colour (side, side, 3) of a spoon, ring or cup with a dark hollow, on a shaft.
-
-    The hollow mirrors the dark, evenly and with a sharp border: it looks like an opening.
-    """
-    along, across = _along(rng)
-    along = along - rng.uniform(-0.5, 0.7) * _HALF
-    across = across - rng.uniform(-0.6, 0.6) * _HALF
-    long = float(np.exp(rng.uniform(np.log(0.1), np.log(0.4)))) * _HALF
-    short = long * rng.uniform(0.3, 1.0)
-    hollow = rng.uniform(0.45, 0.9)
-    radius = np.sqrt((along / long) ** 2 + (across / short) ** 2)
-    stem = np.where(along > 0.0, rng.uniform(0.25, 0.8) * short - np.abs(across), -_HALF)
-    inside = np.maximum((1.0 - radius) * short, stem)
-    steel = np.array(STEEL[rng.integers(3, len(STEEL))], np.float32) * rng.uniform(0.5, 1.25)
-    turn = np.arctan2(across / short, along / long)
-    lit = 0.65 + 0.35 * np.cos(rng.integers(1, 4) * (turn - rng.uniform(0.0, 6.3)))
-    colour = steel * lit[..., None]
-    depth = np.clip((hollow - radius) * short / rng.uniform(0.8, 3.0) + 0.5, 0.0, 1.0)
-    mirrored = cv2.GaussianBlur(example.image, (0, 0), 5.0) * rng.uniform(0.02, 0.6)
-    slope = 1.0 + rng.uniform(-0.8, 0.8) * (along / long if rng.random() < 0.5 else across / short)
-    bottom = mirrored * np.clip(slope, 0.0, 2.0)[..., None] + rng.uniform(0.0, 12.0)
-    colour = colour * (1.0 - depth[..., None]) + bottom * depth[..., None]
-    if rng.random() < 0.4:  # a lamp's mirror image
-        spot = np.hypot(along - rng.uniform(-0.6, 0.6) * long, across - rng.uniform(-0.6, 0.6) * short)
-        colour = colour + 220.0 * np.exp(-((spot / rng.uniform(1.0, 5.0)) ** 2))[..., None]
     soft = rng.uniform(0.8, 3.0)
     return np.clip(0.5 + inside / soft, 0.0, 1.0), np.clip(colour, 0.0, 255.0)
 
