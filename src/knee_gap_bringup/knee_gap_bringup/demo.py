@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from knee_gap_bringup.gap_plot import write_gap_plot
-from knee_gap_bringup.launching.plan import DRAIN, NODES
+from knee_gap_bringup.launching.plan import DRAIN, NODES, parameter_arguments, scope_parameters
 from knee_gap_bringup.launching.processes import Processes, StartError, executable
-from knee_gap_bringup.simulated_calibration import CALIBRATION_FILE
 from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.errors import BagError
 from knee_gap_core.node.arguments import Parser, finite
@@ -79,12 +78,8 @@ def play_through_nodes(bag: Path, out: Path, begin: float, rate: float = 1.0) ->
 
 
 def scope_arguments(node: str, bag: Path) -> list[str]:
-    """Parameters that describe the scope to a node: the bag's calibration, or the lens's nominal pose."""
-    calibration = bag / CALIBRATION_FILE
-    if calibration.is_file():
-        # The same for the two nodes that use it; uncertainty_node receives it from them.
-        return [] if node == "uncertainty_node" else ["-p", f"calibration_file:={calibration.resolve()}"]
-    return ["--params-file", str(bag / PARAMETERS_FILE)] if node == "tracking_node" else []
+    """Command line arguments that describe the scope to a node: the bag's calibration, or the nominal one."""
+    return list(parameter_arguments(scope_parameters(bag, node)))
 
 
 def run(bag: Path, out: Path, rate: float) -> None:

@@ -23,20 +23,27 @@ TRANSPORT = SHARE / "launch" / "transport.launch.py"
 
 def start(context: object) -> list[object]:
     """Three nodes in one namespace, with one parameter file."""
-    params, namespace, respawn, delay = (
+    params, namespace, respawn, delay, one_process = (
         LaunchConfiguration(name).perform(context)
-        for name in ("params", "namespace", "respawn", "respawn_delay")
+        for name in ("params", "namespace", "respawn", "respawn_delay", "one_process")
     )
     refuse(live_problem(params, delay))
-    return actions(live_plan(params, namespace, respawn=respawn == "true"), float(delay))
+    plan = live_plan(params, namespace, respawn=respawn == "true", one_process=one_process == "true")
+    return actions(plan, float(delay))
 
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments and what they start."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params", default_value=str(CONFIG / "knee_gap.yaml")),
-            DeclareLaunchArgument("namespace", default_value="knee_gap"),
+            DeclareLaunchArgument(
+                "params",
+                default_value=str(CONFIG / "knee_gap.yaml"),
+                description="parameter file of the nodes",
+            ),
+            DeclareLaunchArgument(
+                "namespace", default_value="knee_gap", description="namespace of the nodes"
+            ),
             DeclareLaunchArgument(
                 "respawn",
                 default_value="true",
@@ -45,6 +52,12 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 "respawn_delay", default_value=str(RESPAWN_DELAY), description="pause before a restart [s]"
+            ),
+            DeclareLaunchArgument(
+                "one_process",
+                default_value="false",
+                choices=["true", "false"],
+                description="the three nodes in one process, suite_node",
             ),
             IncludeLaunchDescription(PythonLaunchDescriptionSource(str(TRANSPORT))),
             OpaqueFunction(function=start),

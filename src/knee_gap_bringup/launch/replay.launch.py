@@ -33,11 +33,13 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("bag", description="bag folder or .mcap file"),
             DeclareLaunchArgument("out", default_value="", description="bag to record the results to"),
-            DeclareLaunchArgument("rate", default_value="1.0"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="times real time"),
             DeclareLaunchArgument(
                 "params", default_value="", description="parameter file of the nodes; scope.yaml of the bag"
             ),
-            DeclareLaunchArgument("namespace", default_value="knee_gap"),
+            DeclareLaunchArgument(
+                "namespace", default_value="knee_gap", description="namespace of the nodes and of the bag"
+            ),
             IncludeLaunchDescription(transport),
             OpaqueFunction(function=start),
         ]

@@ -69,12 +69,12 @@ def test_a_replay_is_three_nodes_a_recorder_and_the_player_last(bag):
     assert [process.executable for process in replay_plan(str(bag), "")] == [*NODES, "play"]
 
 
-def test_what_stands_beside_a_bag_is_of_the_tracked_body_alone(bag):
+def test_what_stands_beside_a_bag_is_for_the_two_nodes_that_use_the_scope(bag):
     beside = bag / "scope.yaml"
     beside.touch()
     segmentation, tracking, uncertainty, _ = replay_plan(str(bag), "")
     assert tracking.parameters == (str(beside),)
-    assert segmentation.parameters == ({"image_transport": "compressed", "max_image_lag": 0.0},)
+    assert segmentation.parameters == (str(beside), {"image_transport": "compressed", "max_image_lag": 0.0})
     assert uncertainty.parameters == ()
     plan = replay_plan(str(bag), "", params="mine.yaml")
     assert all("mine.yaml" in process.parameters for process in plan if process.role is Role.NODE)
@@ -108,6 +108,12 @@ def test_live_nodes_are_started_again_as_asked(respawn):
     plan = live_plan("mine.yaml", "knee_gap", respawn=respawn)
     assert [process.executable for process in plan] == list(NODES)
     assert {process.respawn for process in plan} == {respawn}
+
+
+def test_one_process_is_the_suite_with_the_same_parameters():
+    (suite,) = live_plan("mine.yaml", "left", one_process=True)
+    assert (suite.package, suite.executable) == ("knee_gap_bringup", "suite_node")
+    assert " ".join(suite.ros_arguments) == "--ros-args -r __ns:=/left --params-file mine.yaml"
 
 
 @pytest.mark.parametrize(

@@ -32,11 +32,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--respawn-delay", default=str(RESPAWN_DELAY), metavar="S", help="pause before a restart (1)"
     )
+    parser.add_argument(
+        "--one-process", action="store_true", help="the three nodes in one process, suite_node"
+    )
     arguments = parser.parse_args(argv)
     if problem := live_problem(arguments.params, arguments.respawn_delay):
         print(f"live: {problem}", file=sys.stderr)
         return 1
-    plan = live_plan(arguments.params, arguments.namespace, respawn=arguments.respawn)
+    plan = live_plan(
+        arguments.params,
+        arguments.namespace,
+        respawn=arguments.respawn,
+        one_process=arguments.one_process,
+    )
     return supervise(plan, tell=tell, respawn_delay=float(arguments.respawn_delay))
 
 

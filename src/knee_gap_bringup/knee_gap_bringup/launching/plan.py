@@ -6,7 +6,7 @@ installed, `supervisor` runs it. Both use these functions, so they behave alike.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -19,6 +19,7 @@ NODES = {
     "tracking_node": "knee_gap_perception",
     "uncertainty_node": "knee_gap_uncertainty",
 }
+SUITE = {"suite_node": "knee_gap_bringup"}
 INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
 OUTPUTS = (
     "gap_edges",
@@ -84,21 +85,30 @@ class PlannedProcess:
         """Command line arguments that set a node's namespace and parameters."""
         if self.role is not Role.NODE:
             return ()
-        given = ["--ros-args", "-r", f"__ns:={absolute(self.namespace)}"]
-        for parameters in self.parameters:
-            if isinstance(parameters, str):
-                given += ["--params-file", parameters]
-            else:
-                for name, value in parameters.items():
-                    given += ["-p", f"{name}:={value}"]
-        return tuple(given)
+        given = ("--ros-args", "-r", f"__ns:={absolute(self.namespace)}")
+        return (*given, *parameter_arguments(self.parameters))
 
 
-def live_plan(params: str, namespace: str, *, respawn: bool = True) -> tuple[PlannedProcess, ...]:
-    """Plan of the three nodes with one parameter file; with `respawn`, nodes that end are restarted."""
+def parameter_arguments(given: Iterable[str | Mapping[str, object]]) -> Iterator[str]:
+    """Command line arguments, after --ros-args, of parameter files and of mappings of parameters."""
+    for parameters in given:
+        if isinstance(parameters, str):
+            yield from ("--params-file", parameters)
+        else:
+            for name, value in parameters.items():
+                yield from ("-p", f"{name}:={value}")
+
+
+def live_plan(
+    params: str, namespace: str, *, respawn: bool = True, one_process: bool = False
+) -> tuple[PlannedProcess, ...]:
+    """Plan of the three nodes with one parameter file; with `respawn`, nodes that end are restarted.
+
+    With `one_process` they are those of suite_node.
+    """
     return tuple(
         PlannedProcess(package, name, namespace=namespace, parameters=(params,), respawn=respawn)
-        for name, package in NODES.items()
+        for name, package in (SUITE if one_process else NODES).items()
     )
 
 
@@ -110,7 +120,7 @@ def replay_plan(
     inputs = [f"{space}/{topic}" for topic in INPUTS]
     given = (params,) if params else ()
     own: dict[str, tuple[str | Mapping[str, object], ...]] = {
-        name: given or _beside(Path(bag), name) for name in NODES
+        name: given or scope_parameters(Path(bag), name) for name in NODES
     }
     # Of a recording every image is wanted, however late it is answered.
     own["segmentation_node"] += ({"image_transport": "compressed", "max_image_lag": 0.0},)
@@ -126,13 +136,17 @@ def replay_plan(
     return tuple(plan)
 
 
-def _beside(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
-    """Parameters for a node in a simulated bag's folder: its calibration, or the nominal pose of the lens."""
+def scope_parameters(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
+    """Parameters that describe the scope to a node, in a simulated bag's folder.
+
+    They are the bag's calibration, or the nominal scope; a bag that is not simulated has none.
+    """
     calibration, nominal = bag / CALIBRATION_FILE, bag / "scope.yaml"
     if calibration.is_file():
         # uncertainty_node receives it from the two others.
         return () if node == "uncertainty_node" else ({"calibration_file": str(calibration.resolve())},)
-    return (str(nominal),) if node == "tracking_node" and nominal.is_file() else ()
+    # The medium of the camera model is in it as well as the pose of the lens.
+    return (str(nominal),) if node != "uncertainty_node" and nominal.is_file() else ()
 
 
 def live_problem(params: str, respawn_delay: str = str(RESPAWN_DELAY)) -> str:

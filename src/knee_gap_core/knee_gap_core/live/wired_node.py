@@ -29,7 +29,7 @@ PROFILES = {
     ),
 }
 
-# The executor asks each handler of events at each message; rclpy makes two for each publisher and subscription.
+# The executor asks each handler of events at each message; rclpy makes two for a publisher or subscription.
 NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Sequence
 from typing import NoReturn
 
 
@@ -11,6 +12,13 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the mistake and exit with 2."""
         self.exit(2, f"{self.prog}: {message}\n")
+
+    def parse(self, argv: Sequence[str] | None = None) -> argparse.Namespace:
+        """The arguments; options may stand between several positional ones (OUT --force TOPIC TOPIC)."""
+        try:
+            return self.parse_intermixed_args(argv)
+        except TypeError:  # not for a parser of subcommands
+            return self.parse_args(argv)
 
 
 def positive(text: str) -> float:

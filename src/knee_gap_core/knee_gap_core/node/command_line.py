@@ -25,7 +25,7 @@ def run(
     parser: Parser, command: Callable[[argparse.Namespace], int], argv: Sequence[str] | None = None
 ) -> int:
     """Parse, run the command, and return its exit code; 1 and one line for a mistake."""
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse(argv)
     # Ended from outside, a command still closes what it writes; those that end by themselves set their own.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.basicConfig(level=logging.WARNING, format=f"{parser.prog}: %(message)s", stream=sys.stderr)
