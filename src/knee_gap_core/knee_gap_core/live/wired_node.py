@@ -18,8 +18,11 @@ from knee_gap_core.node.wiring import Health, InputTopic, NodeCore, Notice, Outc
 DEADLINE = Duration(nanoseconds=100_000_000)
 # Of each of so many nodes the last message is kept.
 MOST_LATCHING = 8
+# Compressed images that may wait, a quarter of a second: estimates that are half a second late are refused.
+MOST_COMPRESSED = 16
 PROFILES = {
     Qos.IMAGE: IMAGE_QOS,
+    Qos.COMPRESSED_IMAGE: QoSProfile(depth=MOST_COMPRESSED, reliability=IMAGE_QOS.reliability),
     Qos.TRACKER: TRACKER_QOS,
     Qos.RESULT: RESULT_QOS,
     Qos.DEADLINE: QoSProfile(depth=RESULT_QOS.depth, reliability=RESULT_QOS.reliability, deadline=DEADLINE),

@@ -24,6 +24,8 @@ class Qos(StrEnum):
     """Quality of service by its purpose; `base_node` has ROS's profile of each."""
 
     IMAGE = "image"
+    # Small, so that more may wait while the first image of a recording is searched.
+    COMPRESSED_IMAGE = "compressed_image"
     TRACKER = "tracker"
     RESULT = "result"
     # A result whose absence the middleware reports to a subscriber.
@@ -37,7 +39,7 @@ class Qos(StrEnum):
         """The profile with which a bag holds a topic."""
         if self in (Qos.LATCHED, Qos.LATCHED_BY_SEVERAL):
             return "latched"
-        return "sensor" if self in (Qos.IMAGE, Qos.TRACKER) else "reliable"
+        return "sensor" if self in (Qos.IMAGE, Qos.COMPRESSED_IMAGE, Qos.TRACKER) else "reliable"
 
 
 class InputTopic(NamedTuple):

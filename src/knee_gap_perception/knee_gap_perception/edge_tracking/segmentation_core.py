@@ -25,7 +25,11 @@ SCOPE_POSE = InputTopic("scope_pose", "geometry_msgs/msg/PoseWithCovarianceStamp
 IMAGES = {
     "raw": InputTopic("image_raw", "sensor_msgs/msg/Image", Qos.IMAGE, from_driver=True, needed=True),
     "compressed": InputTopic(
-        "image_raw/compressed", "sensor_msgs/msg/CompressedImage", Qos.IMAGE, from_driver=True, needed=True
+        "image_raw/compressed",
+        "sensor_msgs/msg/CompressedImage",
+        Qos.COMPRESSED_IMAGE,
+        from_driver=True,
+        needed=True,
     ),
 }
 GAP_EDGES = OutputTopic("gap_edges", "knee_gap_msgs/msg/GapEdges", Qos.RESULT)
