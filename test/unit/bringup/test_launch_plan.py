@@ -18,6 +18,7 @@ from knee_gap_bringup.launching.plan import (
     replay_plan,
     replay_problem,
 )
+from knee_gap_core.bag.bag import BagWriter
 
 NODE = PlannedProcess("knee_gap_perception", "segmentation_node")
 AGAIN = PlannedProcess("knee_gap_perception", "segmentation_node", respawn=True)
@@ -79,6 +80,33 @@ def test_what_stands_beside_a_bag_is_for_the_two_nodes_that_use_the_scope(bag):
     plan = replay_plan(str(bag), "", params="mine.yaml")
     assert all("mine.yaml" in process.parameters for process in plan if process.role is Role.NODE)
     assert not any(str(beside) in process.parameters for process in plan)
+
+
+def test_a_bare_file_has_the_scope_beside_it(bag):
+    beside = bag / "scope.yaml"
+    beside.touch()
+    segmentation, tracking, *_ = replay_plan(str(bag / "bag_0.mcap"), "")
+    assert tracking.parameters == (str(beside),)
+    assert segmentation.parameters[0] == str(beside)
+
+
+@pytest.mark.parametrize(
+    ("topics", "transport", "played"),
+    [
+        (["image_raw"], "raw", "image_raw"),
+        (["image_raw/compressed"], "compressed", "image_raw/compressed"),
+        (["image_raw", "image_raw/compressed"], "compressed", "image_raw/compressed"),
+    ],
+)
+def test_the_images_that_a_bag_has_are_played(topics, transport, played, tmp_path):
+    kinds = {"image_raw": "sensor_msgs/msg/Image", "image_raw/compressed": "sensor_msgs/msg/CompressedImage"}
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic in topics:
+            writer.add_topic(f"/left/{topic}", kinds[topic])
+    segmentation, *_, player = replay_plan(str(tmp_path / "bag"), "", namespace="left")
+    assert segmentation.parameters == ({"image_transport": transport, "max_image_lag": 0.0},)
+    inputs = [f"/left/{name}" for name in (played, "camera_info", "scope_body/pose")]
+    assert list(player.arguments)[4:7] == inputs
 
 
 def test_a_calibration_beside_a_bag_is_for_both_nodes_that_use_one(bag):

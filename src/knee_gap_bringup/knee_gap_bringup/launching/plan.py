@@ -12,7 +12,9 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
+from knee_gap_core.bag.bag import BagReader
 from knee_gap_core.bag.bag_paths import missing_bag
+from knee_gap_core.bag.errors import BagError
 
 NODES = {
     "segmentation_node": "knee_gap_perception",
@@ -20,7 +22,9 @@ NODES = {
     "uncertainty_node": "knee_gap_uncertainty",
 }
 SUITE = {"suite_node": "knee_gap_bringup"}
-INPUTS = ("image_raw/compressed", "camera_info", "scope_body/pose")
+# Of a bag with both, the compressed images are played.
+IMAGES = {"compressed": "image_raw/compressed", "raw": "image_raw"}
+OTHER_INPUTS = ("camera_info", "scope_body/pose")
 OUTPUTS = (
     "gap_edges",
     "scope_pose",
@@ -117,13 +121,14 @@ def replay_plan(
 ) -> tuple[PlannedProcess, ...]:
     """Plan of the three nodes, a recorder if `out` is given, and the player, whose end ends the launch."""
     space = absolute(namespace)
-    inputs = [f"{space}/{topic}" for topic in INPUTS]
+    transport = image_transport(Path(bag), space)
+    inputs = [f"{space}/{topic}" for topic in (IMAGES[transport], *OTHER_INPUTS)]
     given = (params,) if params else ()
     own: dict[str, tuple[str | Mapping[str, object], ...]] = {
         name: given or scope_parameters(Path(bag), name) for name in NODES
     }
     # Of a recording every image is wanted, however late it is answered.
-    own["segmentation_node"] += ({"image_transport": "compressed", "max_image_lag": 0.0},)
+    own["segmentation_node"] += ({"image_transport": transport, "max_image_lag": 0.0},)
     plan = [
         PlannedProcess(package, name, namespace=namespace, parameters=own[name])
         for name, package in NODES.items()
@@ -136,12 +141,23 @@ def replay_plan(
     return tuple(plan)
 
 
+def image_transport(bag: Path, space: str) -> str:
+    """Transport of the images in a bag: raw if it has no compressed ones; play reports what cannot be read."""
+    try:
+        with BagReader(bag) as reader:
+            topics = set(reader.topics)
+    except (BagError, OSError):
+        return "compressed"
+    return next((name for name, topic in IMAGES.items() if f"{space}/{topic}" in topics), "compressed")
+
+
 def scope_parameters(bag: Path, node: str) -> tuple[str | Mapping[str, object], ...]:
-    """Parameters that describe the scope to a node, in a simulated bag's folder.
+    """Parameters that describe the scope to a node, in a simulated bag's folder or beside its file.
 
     They are the bag's calibration, or the nominal scope; a bag that is not simulated has none.
     """
-    calibration, nominal = bag / CALIBRATION_FILE, bag / "scope.yaml"
+    folder = bag if bag.is_dir() else bag.parent
+    calibration, nominal = folder / CALIBRATION_FILE, folder / "scope.yaml"
     if calibration.is_file():
         # uncertainty_node receives it from the two others.
         return () if node == "uncertainty_node" else ({"calibration_file": str(calibration.resolve())},)
