@@ -65,17 +65,30 @@ class TopicCheck:
         """Times from stamp to recording."""
         return np.asarray(self.record_ns, dtype=np.int64) - self.times_ns
 
+    @property
+    def usual(self) -> npt.NDArray[np.bool_]:
+        """Which messages are stamped by the clock of most: what a node reports of silence is not."""
+        lags_ns = self.lags_ns
+        return np.asarray(np.abs(lags_ns - np.median(lags_ns)) < OTHER_CLOCK_NS)
+
+    @property
+    def usual_times(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Recording times and stamps of the messages that are stamped by the clock of most."""
+        return np.asarray(self.record_ns, dtype=np.int64)[self.usual], self.times_ns[self.usual]
+
     def _latency(self) -> Iterator[str]:
         if not self.stamp_ns:
             return
+        if others := int(np.count_nonzero(~self.usual)):
+            yield f"{others} stamped by another clock"
         if abs(lag_ns := int(np.median(self.lags_ns))) < OTHER_CLOCK_NS:
-            latency = self.lags_ns * 1e-6
+            latency = self.lags_ns[self.usual] * 1e-6
             yield f"latency {np.median(latency):.1f} ms, at most {latency.max():.1f} ms"
             return
         when = "after" if lag_ns > 0 else "before"
         yield f"recorded {abs(lag_ns) / _DAY_NS:.1f} days {when} it was stamped"
         if self.clock is not None:
-            latency = self.clock.latency_ns(np.asarray(self.record_ns), self.times_ns) * 1e-6
+            latency = self.clock.latency_ns(*self.usual_times) * 1e-6
             words = f"{np.median(latency):.1f} ms, at most {latency.max():.1f} ms"
             yield f"{self.clock.words}: latency above the least {words}"
 
@@ -87,7 +100,7 @@ def _set_clocks(checks: Iterable[TopicCheck]) -> None:
         lag_ns = np.median(far[0].lags_ns)
         alike = [check for check in far if abs(np.median(check.lags_ns) - lag_ns) < OTHER_CLOCK_NS]
         far = [check for check in far if all(check is not one for one in alike)]
-        clock = replay_clock([(np.asarray(one.record_ns, dtype=np.int64), one.times_ns) for one in alike])
+        clock = replay_clock([one.usual_times for one in alike])
         for check in alike:
             check.clock = clock
 

@@ -92,12 +92,17 @@ def test_latency_in_a_replay_is_by_the_clock_of_the_replay(
             set_stamp(message.header, stamp_ns)
             for topic, late_ms in (("/image", 2), ("/answer", 11)):
                 bag.write(topic, message, 3 * YEAR_NS + 2 * stamp_ns + late_ms * MS)
+        # As a node reports silence, before the first image and after the last: by its own clock.
+        for now_ns in (3 * YEAR_NS - 50 * MS, 3 * YEAR_NS + 4_000 * MS):
+            set_stamp(message.header, now_ns)
+            bag.write("/answer", message, now_ns)
     check.main([str(tmp_path / "bag")])
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     for topic, latency_ms in (("/image", "0.0"), ("/answer", "9.0")):
         assert "recorded 1095.0 days after it was stamped" in lines[topic]
         assert "replayed at 0.5 times its rate" in lines[topic]
         assert f"latency above the least {latency_ms} ms, at most {latency_ms} ms" in lines[topic]
+    assert "2 stamped by another clock" in lines["/answer"]
 
 
 def test_images_that_cannot_be_read_are_not_usable(

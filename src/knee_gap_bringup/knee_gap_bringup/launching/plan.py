@@ -142,7 +142,7 @@ def replay_plan(
 
 
 def image_transport(bag: Path, space: str) -> str:
-    """Transport of the images in a bag: raw if it has no compressed ones; play reports what cannot be read."""
+    """Transport of the images in a bag: raw if no compressed ones are; play reports what cannot be read."""
     try:
         with BagReader(bag) as reader:
             topics = set(reader.topics)
