@@ -119,7 +119,7 @@ class EstimatorParameters:
     least_baseline: float = field(
         default=0.5e-3,
         metadata={
-            "description": "how far the lens must be from the track's first view for a gap to be valid [m]",
+            "description": "baseline that a gap needs to be valid [m]",
             "range": (0.0, 0.1),
         },
     )

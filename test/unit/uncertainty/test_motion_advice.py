@@ -55,6 +55,7 @@ def situation(
         frame_id="arthroscope_optical",
         track_id=1,
         first_lens=lens[0],
+        reference_lens=lens[0],
         lens=lens[-1],
         rotation=np.eye(3),
         points=POINTS,

@@ -5,14 +5,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtri
 
+from knee_gap_core.values.arrays import Array
 from knee_gap_core.values.edges import GapEdges
 from knee_gap_core.values.errors import BaselineTooShortError, MeasurementError
 from knee_gap_core.values.gap_estimate import GapEstimate, GapStatus
 from knee_gap_core.values.poses import LensPose
 from knee_gap_uncertainty.estimation.acceptance import Facts, Kept, judge
+from knee_gap_uncertainty.estimation.reference_view import ReferenceViews, between
 from knee_gap_uncertainty.estimator_parameters import EstimatorParameters
 from knee_gap_uncertainty.instrument_gap.gap_profile import GapProfile, gap_profile
 from knee_gap_uncertainty.instrument_gap.instrument_gap import (
@@ -38,8 +39,6 @@ from knee_gap_uncertainty.scope_calibration.scope_calibration import Calibration
 from knee_gap_uncertainty.two_view.angle_sets import INTERVAL_SIGNS, SIGNS
 from knee_gap_uncertainty.two_view.gap_range import GapRange, gap_range_and_points
 from knee_gap_uncertainty.two_view.translation_volume import displacements
-
-Floats = npt.NDArray[np.float64]
 
 # The direction of travel is that over this time [ns], if the lens went farther in it than this [m].
 DIRECTION_TIME_NS = 250_000_000
@@ -76,7 +75,7 @@ class Track:
         self.track_id = track_id
         self.frame_id = frame_id
         self._parameters = parameters
-        self._first: PosedView | None = None
+        self._references: ReferenceViews | None = None
         self._bounded: tuple[PosedView, tuple[float, float]] | None = None  # error bounds of the last view
         self._segment = 0
         self._window = ViewWindow()
@@ -100,7 +99,7 @@ class Track:
 
     def breaks_at(self, pose: LensPose) -> bool:
         """Whether the lens made a step, or was lost, between the track's views and this pose."""
-        return self._first is not None and pose.segment != self._segment
+        return self._references is not None and pose.segment != self._segment
 
     def add(self, edges: GapEdges, pose: LensPose) -> GapEstimate:
         """Add the next view; return the estimate at it."""
@@ -117,24 +116,25 @@ class Track:
             view = posed_view(edges, pose, self._parameters.tracker_bound, self._camera_error)
         except MeasurementError as error:
             return self._refused(blank, Facts(self._parameters, edges_flaw=str(error)))
-        if self._first is None:
-            self._first, self._segment = view, pose.segment
+        if self._references is None:
+            self._references, self._segment = ReferenceViews(view), pose.segment
+        first, reference = self._references.first, self._references.of(view)
         self._follow_direction(view)
-        baseline = float(np.linalg.norm(view.lens - self._first.lens))
-        blank = replace(blank, baseline=baseline, view_count=len(self._window))
+        blank = replace(blank, baseline=between(view, reference), view_count=len(self._window))
         views = self._views_with(view.view)
         fitted, no_fit = self._fitted(views)
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
             return self._contradicted(blank, finding)
         self._admit_creep()
+        self._references.note(view)
         self._passing = None if self._window.add(view.view) else view.view
         blank = replace(blank, view_count=len(self._window))
         if fitted is None:
             return self._refused(blank, Facts(self._parameters, error=no_fit))
         parameters = self._parameters
         fitted = with_scale_drift(
-            fitted, views, self._first.lens, parameters.scale_drift, parameters.correlated_error_share
+            fitted, views, first.lens, parameters.scale_drift, parameters.correlated_error_share
         )
         try:
             fitted = self._calibration.widened(fitted, views)
@@ -142,7 +142,7 @@ class Track:
             all_views = AllViews(views, fitted, interval)
             section = self._section.at(edges, view, _nearest(fitted.points, view.lens))
             self.situation = self._situation(edges, view, all_views, section)
-            bounds, parallax = self._bounds(self._first, view)
+            bounds, parallax = self._bounds(reference, view)
         except MeasurementError as error:
             return self._refused(blank, Facts(self._parameters, error=error))
         return self._measured(blank, edges, view, bounds, parallax, all_views, section)
@@ -210,16 +210,18 @@ class Track:
         self, edges: GapEdges, present: PosedView, all_views: AllViews, section: Edges | str
     ) -> Situation | None:
         """What advice on motion can be based on; None while the points or the edges are not known at all."""
-        assert self._first is not None
+        assert self._references is not None
         assert all_views.views.lens_rotations is not None
         if isinstance(section, str) or not np.isfinite(all_views.fit.points).all():
             return None
-        angular_error, translation_error = self._error_bounds(self._first, present)
+        reference = self._references.of(present)
+        angular_error, translation_error = self._error_bounds(reference, present)
         return Situation(
             stamp_ns=present.stamp_ns,
             frame_id=edges.frame_id,
             track_id=self.track_id,
-            first_lens=self._first.lens,
+            first_lens=self._references.first.lens,
+            reference_lens=reference.lens,
             lens=present.lens,
             rotation=all_views.views.lens_rotations[-1],
             points=all_views.fit.points,
@@ -236,12 +238,12 @@ class Track:
             edges=section,
         )
 
-    def _bounds(self, first: PosedView, present: PosedView) -> tuple[GapRange, float]:
-        """Bounds from the first and the present view, and the smaller parallax of the two points [rad]."""
-        angular_error, translation_error = self._error_bounds(first, present)
+    def _bounds(self, reference: PosedView, present: PosedView) -> tuple[GapRange, float]:
+        """Bounds from another and the present view, and the smaller parallax of the two points [rad]."""
+        angular_error, translation_error = self._error_bounds(reference, present)
         bounds, points = gap_range_and_points(
-            (first.lens, present.lens),
-            (first.bearings, present.bearings),
+            (reference.lens, present.lens),
+            (reference.bearings, present.bearings),
             angular_error=angular_error,
             translation_error=translation_error,
             interval=self._parameters.interval,
@@ -249,13 +251,13 @@ class Track:
         )
         return bounds, float(np.min(points.gamma))
 
-    def _error_bounds(self, first: PosedView, present: PosedView) -> tuple[float, float]:
+    def _error_bounds(self, reference: PosedView, present: PosedView) -> tuple[float, float]:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
         if self._bounded is not None and self._bounded[0] is present:
             return self._bounded[1]
-        angle = max(first.angular_error, present.angular_error)
-        position = max(first.translation_error, present.translation_error)
-        shared = self._admitted.bounds(first, present, self._parameters.tracker_bound)
+        angle = max(reference.angular_error, present.angular_error)
+        position = max(reference.translation_error, present.translation_error)
+        shared = self._admitted.bounds(reference, present, self._parameters.tracker_bound)
         self._bounded = present, (angle + shared[0], position + shared[1])
         return self._bounded[1]
 
@@ -356,14 +358,15 @@ class Track:
             shares=np.append(fitted.shares * (1.0 - found.shares.sum()), found.shares),
         )
 
-    def _admitted_ranges(self, present: PosedView, opening: Opening) -> tuple[Floats, Floats]:
-        """Distances (m, 2) [m] of the points that the errors of the first and the present view allow."""
-        assert self._first is not None
-        angular_error, translation_error = self._error_bounds(self._first, present)
+    def _admitted_ranges(self, present: PosedView, opening: Opening) -> tuple[Array, Array]:
+        """Distances (m, 2) [m] of the points that the errors of two views, one the present, allow."""
+        assert self._references is not None
+        reference = self._references.of(present)
+        angular_error, translation_error = self._error_bounds(reference, present)
         return admitted_ranges(
-            self._first.lens - present.lens,
+            reference.lens - present.lens,
             present.bearings,
-            self._first.bearings,
+            reference.bearings,
             opening,
             angular_error,
             displacements(translation_error, 1),
@@ -375,7 +378,7 @@ class Track:
         observation: GapEdges,
         view: PosedView,
         fitted: MultiViewFit,
-        near_far: tuple[Floats, Floats],
+        near_far: tuple[Array, Array],
         opening: Opening,
         edges: Edges,
     ) -> GapProfile:
@@ -393,6 +396,6 @@ class Track:
         )
 
 
-def _nearest(points: Floats, lens: Floats) -> float:
+def _nearest(points: Array, lens: Array) -> float:
     """Distance [m] of the nearer point (2, 3) from a lens (3,); infinite where neither is known."""
     return float(np.nanmin(np.linalg.norm(points - lens, axis=1), initial=np.inf))

@@ -81,18 +81,19 @@ class AdviceParameters:
 class Situation(NamedTuple):
     """What is known at an image; all in the frame of the poses, `frame_id` is that of the lens.
 
-    `first_lens`, `lens` (3,) [m] where the track began and where it is; `rotation` (3, 3) maps lens
-    coordinates to that frame; `points` (2, 3) [m] as estimated; `angular_error` [rad], `image_error` [rad],
-    the part of it that is the image's alone, and `translation_error` [m] bound the errors; `views` are those
-    of the track, the present one last; `direction` (3,) is the unit
-    vector of the present travel. `scale_drift` and `correlated_error_share` are the estimator's. `edges` are
-    those of the opening that the present lens sees.
+    `first_lens`, `lens` (3,) [m] where the track began and where it is, `reference_lens` (3,) [m] that of the
+    view with which the bounds are made; `rotation` (3, 3) maps lens coordinates to that frame; `points`
+    (2, 3) [m] as estimated; `angular_error` [rad], `image_error` [rad], the part of it that is the image's
+    alone, and `translation_error` [m] bound the errors; `views` are those of the track, the present one last;
+    `direction` (3,) is the unit vector of the present travel. `scale_drift` and `correlated_error_share` are
+    the estimator's. `edges` are those of the opening that the present lens sees.
     """
 
     stamp_ns: int
     frame_id: str
     track_id: int
     first_lens: Floats
+    reference_lens: Floats
     lens: Floats
     rotation: Floats
     points: Floats
@@ -143,15 +144,15 @@ def snr_after(situation: Situation, offset: Floats, places: Floats | None = None
     `places` are those of `places_of`, if they are known already.
     """
     lens = situation.lens + offset
-    if not float(np.linalg.norm(lens - situation.first_lens)) > 2.0 * situation.translation_error:
+    if not float(np.linalg.norm(lens - situation.reference_lens)) > 2.0 * situation.translation_error:
         return 0.0
     edges = edges_after(situation, lens, places)
     bearings = unit(situation.points - lens)
     opening = opening_of(bearings, edges.bearings)
     gap_min, gap_max = worst_case(
-        situation.first_lens - lens,
+        situation.reference_lens - lens,
         bearings,
-        unit(situation.points - situation.first_lens),
+        unit(situation.points - situation.reference_lens),
         opening,
         edges,
         situation.angular_error,
