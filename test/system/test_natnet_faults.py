@@ -71,7 +71,7 @@ class Judged:
     ("fault", "reason", "words"),
     [
         (["--freeze-every", "3.3", "--freeze-for", "0.8"], "frozen", ["the driver is frozen"]),
-        (["--swap-every", "3.3", "--swap-for", "0.8"], "swapped", ["calls 'tibia' by the name of the body"]),
+        (["--swap-every", "3.3", "--swap-for", "0.8"], "swapped", ["gives the body's label to 'tibia'"]),
         (["--jump-every", "3.3", "--jump-for", "0.8"], "jump", ["a jump", "has not come back"]),
         (["--occlude-every", "3.3", "--occlude-for", "0.8"], "not_tracked", ["does not see the body"]),
     ],

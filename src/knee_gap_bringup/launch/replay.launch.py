@@ -35,7 +35,9 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("out", default_value="", description="bag to record the results to"),
             DeclareLaunchArgument("rate", default_value="1.0", description="times real time"),
             DeclareLaunchArgument(
-                "params", default_value="", description="parameter file of the nodes; scope.yaml of the bag"
+                "params",
+                default_value="",
+                description="parameter file of the nodes; calibration.yaml of the bag, else its scope.yaml",
             ),
             DeclareLaunchArgument(
                 "namespace", default_value="knee_gap", description="namespace of the nodes and of the bag"

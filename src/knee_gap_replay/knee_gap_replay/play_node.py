@@ -241,10 +241,14 @@ def _parser() -> Parser:
     parser.add_argument("--clock", action="store_true", help="publish the bag's time on /clock, at 100 Hz")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play only these topics")
     parser.add_argument(
-        "--start-offset", type=not_negative, default=0.0, metavar="SECONDS", help="begin so late in the bag"
+        "--start-offset",
+        type=not_negative,
+        default=0.0,
+        metavar="SECONDS",
+        help="start at this time after the beginning of the bag",
     )
     parser.add_argument(
-        "--playback-duration", type=positive, metavar="SECONDS", help="play only so much of the bag"
+        "--playback-duration", type=positive, metavar="SECONDS", help="play only this duration"
     )
     parser.add_argument(
         "--start-paused", action="store_true", help="begin paused; needs a terminal for the keys"

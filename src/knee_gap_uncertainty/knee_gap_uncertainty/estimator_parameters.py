@@ -65,7 +65,7 @@ class EstimatorParameters:
         metadata={
             "description": "share of the bearings' variance along the parallax that lasts over a track: at 1 "
             "a depth is known no better than from the best single views, however many there are; "
-            "common_share apart [-]",
+            "in addition to common_share [-]",
             "range": (0.0, 1.0),
         },
     )
@@ -96,8 +96,8 @@ class EstimatorParameters:
     max_delay: float = field(
         default=0.5,
         metadata={
-            "description": "how much later than the lens poses, by its stamp, an image may come and still be "
-            "answered with a number [s]",
+            "description": "largest delay of an image relative to the lens poses, by its stamp, with which "
+            "an estimate can be VALID [s]",
             "range": (0.05, 10.0),
         },
     )
@@ -165,8 +165,8 @@ class EstimatorParameters:
     tracker_scale: float = field(
         default=0.01,
         metadata={
-            "description": "relative standard error of the tracker's lengths: of a wand that nobody measured "
-            "again; no image shows it [-]",
+            "description": "relative standard error of the tracker's scale: of a calibration wand that was "
+            "not measured again; images cannot show it [-]",
             "range": (0.0, 0.2),
         },
     )

@@ -67,7 +67,7 @@ class UncertaintyNode(WiredNode):
         number = info.get("publication_sequence_number")
         if not self._sequences[topic].continues(number, time.monotonic()):
             self.core.estimator.break_input(topic)
-            words = "two nodes publish it, or it was started again"
+            words = "two nodes publish it, or its node was started again; stop all but one"
             self.log_once(f"sequence of {topic}", f"the messages of {topic} have a break: {words}")
 
     def queued_ns(self, info: Mapping[str, int | None]) -> int:

@@ -44,7 +44,7 @@ def test_what_is_wrong_is_one_line_before_anything_is_started(bag, tmp_path):
     there.touch()
     link.symlink_to(tmp_path / "nowhere")
     assert replay_problem(str(tmp_path / "none"), "") == f"bag: {tmp_path / 'none'} does not exist"
-    assert "holds no MCAP file" in replay_problem(str(tmp_path / "bag" / ".."), "")
+    assert "holds no .mcap or .db3 file" in replay_problem(str(tmp_path / "bag" / ".."), "")
     for out in (there, link, bag):
         problem = replay_problem(str(bag), str(out))
         assert problem == f"out: {out} exists already; choose another name or remove it"

@@ -142,7 +142,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, name: str, content: bytes, re
             "stored as leveldb; convert it",
         ),
         ("storage_identifier: mcap\n  compression_mode: FILE", "compressed by file; convert it"),
-        (None, "holds no MCAP file"),
+        (None, "holds no .mcap or .db3 file"),
     ],
 )
 def test_bags_of_other_kinds_are_refused_with_what_to_do(

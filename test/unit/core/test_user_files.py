@@ -141,7 +141,7 @@ def test_why_there_is_no_bag_is_told_by_kind(tmp_path: Path) -> None:
     assert "is a FIFO, not a file" in missing_bag(tmp_path / "fifo")
     assert "is a device, not a file" in missing_bag(Path("/dev/zero"))
     assert "is empty" in missing_bag(tmp_path / "empty.mcap")
-    assert "holds no MCAP file" in missing_bag(tmp_path / "folder")
+    assert "holds no .mcap or .db3 file" in missing_bag(tmp_path / "folder")
     assert "does not exist" in missing_bag(tmp_path / "nothing")
     assert "too long" in missing_bag(tmp_path / ("x" * 300))
     assert missing_bag(tmp_path / "some.mcap") == missing_bag(tmp_path) == ""

@@ -23,7 +23,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--rate", default="1.0", metavar="R", help="times as fast as recorded (1)")
     parser.add_argument(
-        "--params", default="", metavar="FILE", help="parameter file of the nodes (scope.yaml of the bag)"
+        "--params",
+        default="",
+        metavar="FILE",
+        help="parameter file of the nodes (calibration.yaml of the bag, else its scope.yaml)",
     )
     parser.add_argument("--namespace", default="knee_gap", help="namespace of the nodes (knee_gap)")
     given = parser.parse_args(argv)

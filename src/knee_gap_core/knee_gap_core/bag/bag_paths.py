@@ -12,7 +12,7 @@ def missing_bag(path: Path) -> str:
     try:
         if stat.S_ISDIR(os.stat(path).st_mode):
             found = any(name.endswith((".mcap", ".db3")) for name in os.listdir(path))
-            return "" if found else f"{shown(path)} holds no MCAP file"
+            return "" if found else f"{shown(path)} holds no .mcap or .db3 file"
         with open_file(path) as file:
             return "" if file.read(1) else f"{shown(path)} is empty"
     except FileNotFoundError:

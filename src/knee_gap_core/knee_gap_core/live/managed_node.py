@@ -103,4 +103,4 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     def _health_by_state(self, health: Callable[[], Health]) -> Health:
         if self.is_active:
             return health()
-        return False, "not active: change_state configures and activates this node", {}
+        return False, "not active: call change_state to configure and activate this node", {}

@@ -44,7 +44,7 @@ class Fault:
     def line(self) -> str:
         """What a log holds of it."""
         return (
-            f"{self.what} refused: {self.reason}: {self.words} (a mistake of the program; the log at debug "
+            f"{self.what} refused: {self.reason}: {self.words} (a bug in knee_gap; the log at debug "
             "level has the traceback)"
         )
 

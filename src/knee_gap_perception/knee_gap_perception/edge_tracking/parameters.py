@@ -21,8 +21,8 @@ class TransportParameters:
     max_image_lag: float = field(
         default=0.035,
         metadata={
-            "description": "Where images come faster than they are answered: by how much an image may be "
-            "older than the newest one before it is dropped for it; 0: none is dropped [s]",
+            "description": "If images arrive faster than they are processed, those older than the newest by "
+            "more than this are dropped; 0: none is dropped [s]",
             "range": (0.0, 1.0),
         },
     )

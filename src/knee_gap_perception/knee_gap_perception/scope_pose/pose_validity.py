@@ -232,7 +232,10 @@ class PoseValidity:
         if swapped_with is not None:
             # While the labels are in doubt, no time that passes confirms a jump.
             self._jump_stamp_ns = body.stamp_ns
-            return RefusalReason.SWAPPED, f"the tracker calls '{swapped_with}' by the name of the body"
+            return (
+                RefusalReason.SWAPPED,
+                f"labels swapped: the tracker gives the body's label to '{swapped_with}'",
+            )
         if last is not None and _identical(last, body):
             return RefusalReason.FROZEN, "the pose repeats the one before it bit by bit: the driver is frozen"
         self._last = body

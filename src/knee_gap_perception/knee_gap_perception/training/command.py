@@ -76,7 +76,13 @@ def _parser() -> Parser:
     parser.add_argument(
         "--renders", type=Path, required=True, metavar="FOLDER", help="as render_examples writes it"
     )
-    parser.add_argument("--pictures", type=Path, required=True, metavar="FOLDER", help="of picture folders")
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="folder that contains the picture folders",
+    )
     parser.add_argument("--marks", type=Path, nargs="+", required=True, metavar="FILE", help="files of marks")
     parser.add_argument("--seed", type=int, default=14, help="of parameters and batches (14)")
     parser.add_argument(
@@ -85,12 +91,12 @@ def _parser() -> Parser:
         nargs=2,
         default=(1500, 700),
         metavar=("FIRST", "SECOND"),
-        help="on renders, and on the mixture (1500 700)",
+        help="training steps on renders, then on renders and pictures (1500 700)",
     )
     parser.add_argument(
-        "--without", nargs="*", metavar="SOURCE", help="to leave out in turn, one or A+B (each)"
+        "--without", nargs="*", metavar="SOURCE", help="sources, or groups A+B, to leave out in turn (each)"
     )
-    parser.add_argument("--only", action="store_true", help="only those without a source")
+    parser.add_argument("--only", action="store_true", help="train only the networks that leave out a source")
     parser.add_argument("--resume", action="store_true", help="take the first stage from the folder")
     return parser
 

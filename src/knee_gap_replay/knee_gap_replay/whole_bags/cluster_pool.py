@@ -32,7 +32,9 @@ class ClusterPool:
         self._running: dict[Any, str] = {}
         if not self._threads():
             self._client.close()
-            raise BagError(f"the scheduler {address} has no worker: tools/env dask worker {address}")
+            raise BagError(
+                f"the scheduler {address} has no worker; start one: tools/env dask worker {address}"
+            )
 
     @property
     def size(self) -> int:

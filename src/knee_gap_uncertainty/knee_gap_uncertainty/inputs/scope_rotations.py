@@ -20,9 +20,9 @@ class RotationRefusal(StrEnum):
     """Why a turn is not kept, or why there is none at a stamp."""
 
     NOT_FINITE = "the turn is NaN or infinite"
-    TOO_LARGE = "the turn is more than a whole one: is it in radians?"
+    TOO_LARGE = "the rotation exceeds one revolution: is it in radians?"
     NOT_YET = "no scope_rotation follows the stamp yet"
-    NONE_NEAR = "no scope_rotation lies near the image, and the scope's turn is followed"
+    NONE_NEAR = "no scope_rotation within max_pose_age of the image"
 
 
 class ScopeRotations:
