@@ -101,7 +101,7 @@ def test_a_node_that_is_managed_measures_while_it_is_active_alone(
     assert change(client, node, Transition.TRANSITION_CONFIGURE)
     assert state(client, node) == State.PRIMARY_STATE_INACTIVE
     assert tracker.send(30) == 0
-    words = "not active: change_state configures and activates this node"
+    words = "not active: call change_state to configure and activate this node"
     client.spin_until(lambda: said(client)[-1:] == [words])
     assert change(client, node, Transition.TRANSITION_ACTIVATE)
     assert tracker.send(60) > 40
