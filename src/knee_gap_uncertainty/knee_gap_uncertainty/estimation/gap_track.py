@@ -150,9 +150,8 @@ class Track:
     def _views_with(self, present: Views) -> Views:
         """The views kept and then the present one, which is not kept before it has been found to fit them."""
         share = self._parameters.common_share
-        if not len(self._window):
-            return replace(present, common_share=share)
-        return self._window.views(share).joined(present)
+        alone = not len(self._window)
+        return replace(present, common_share=share) if alone else self._window.views(share).joined(present)
 
     def _without_shared_error(
         self, views: Views, fitted: MultiViewFit | None
