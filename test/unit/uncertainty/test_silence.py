@@ -56,6 +56,14 @@ def test_one_lost_image_does_not_change_the_usual_interval() -> None:
     assert silence.is_due(last + (48 + 16 + 31) * MS)
 
 
+def test_a_recording_played_slowly_is_not_silent_between_its_messages() -> None:
+    silence = Silence(MARGIN)
+    for index in range(12):
+        silence.add(index * 8 * MS, index * 33 * MS)
+    assert not silence.is_due((11 * 33 + 33 + 10) * MS)
+    assert silence.is_due((11 * 33 + 33 + 31) * MS)
+
+
 def test_stamps_that_run_backwards_begin_again() -> None:
     silence, last = after_images(16 * MS)
     silence.add(0, last + 16 * MS)

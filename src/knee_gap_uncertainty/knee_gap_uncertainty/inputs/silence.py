@@ -21,7 +21,10 @@ class Silence:
     def __init__(self, margin: float) -> None:
         self._margin_ns = round(margin * NANOSECONDS)
         self._intervals: deque[int] = deque(maxlen=INTERVALS)
+        # A recording played slowly: its messages arrive farther apart than they are stamped.
+        self._arrivals: deque[int] = deque(maxlen=INTERVALS)
         self._last_stamp_ns: int | None = None
+        self._last_arrival_ns = 0
         self._due_ns = 0
 
     def add(self, stamp_ns: int, now_ns: int) -> None:
@@ -29,9 +32,11 @@ class Silence:
         if self._last_stamp_ns is not None:
             if stamp_ns > self._last_stamp_ns:
                 self._intervals.append(stamp_ns - self._last_stamp_ns)
+                self._arrivals.append(now_ns - self._last_arrival_ns)
             else:
                 self._intervals.clear()
-        self._last_stamp_ns = stamp_ns
+                self._arrivals.clear()
+        self._last_stamp_ns, self._last_arrival_ns = stamp_ns, now_ns
         self.restart(now_ns)
 
     def restart(self, now_ns: int) -> None:
@@ -48,4 +53,6 @@ class Silence:
 
     def _usual_ns(self) -> int:
         longest = round(LONGEST_INTERVAL * NANOSECONDS)
-        return min(round(median(self._intervals)), longest) if self._intervals else longest
+        if not self._intervals:
+            return longest
+        return min(max(round(median(self._intervals)), round(median(self._arrivals))), longest)
