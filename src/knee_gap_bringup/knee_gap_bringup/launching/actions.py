@@ -10,7 +10,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 
-from knee_gap_bringup.launching.plan import DRAIN, RESPAWN_DELAY, Next, PlannedProcess, Role, reaction
+from knee_gap_bringup.launching.plan import (
+    DRAIN,
+    RESPAWN_DELAY,
+    SUITE,
+    Next,
+    PlannedProcess,
+    Role,
+    reaction,
+)
 
 # A signal that arrives before a node can handle it stays pending until its entry point unblocks it.
 SIGNALS_WAIT = ("env", "--block-signal=INT", "--block-signal=TERM")
@@ -45,11 +53,13 @@ def _node(process: PlannedProcess, respawn_delay: float) -> object:
     from launch_ros.actions import Node
 
     is_node = process.role is Role.NODE
+    # A name would be that of every node in the process.
+    named = {} if process.executable in SUITE else {"name": process.executable}
     return Node(
         package=process.package,
         executable=process.executable,
         # Player and recorder take absolute topics and set their own node names.
-        **({"name": process.executable, "namespace": process.namespace} if is_node else {}),
+        **({**named, "namespace": process.namespace} if is_node else {}),
         parameters=[*process.parameters] if is_node else None,
         arguments=[*process.arguments],
         output="screen",

@@ -76,6 +76,7 @@ class Track:
         self.frame_id = frame_id
         self._parameters = parameters
         self._references: ReferenceViews | None = None
+        self._reference: PosedView | None = None  # of the present view
         self._bounded: tuple[PosedView, tuple[float, float]] | None = None  # error bounds of the last view
         self._segment = 0
         self._window = ViewWindow()
@@ -119,6 +120,7 @@ class Track:
         if self._references is None:
             self._references, self._segment = ReferenceViews(view), pose.segment
         first, reference = self._references.first, self._references.of(view)
+        self._reference = reference
         self._follow_direction(view)
         blank = replace(blank, baseline=between(view, reference), view_count=len(self._window))
         views = self._views_with(view.view)
@@ -126,8 +128,11 @@ class Track:
         finding = self._joint_motion.judge(*self._without_shared_error(views, fitted))
         if finding is not Finding.STILL:
             return self._contradicted(blank, finding)
-        self._admit_creep()
         self._references.note(view)
+        # The rate of creep is known along the way from the first view.
+        if reference is first:
+            self._admit_creep()
+        self._bounded = None
         self._passing = None if self._window.add(view.view) else view.view
         blank = replace(blank, view_count=len(self._window))
         if fitted is None:
@@ -171,7 +176,6 @@ class Track:
         )
         self.suspects_creep = rate > self._calibration.drift
         self._admitted = replace(self._calibration, drift=max(rate, self._calibration.drift))
-        self._bounded = None
 
     def _fitted(self, views: Views) -> tuple[MultiViewFit | None, MeasurementError | None]:
         """Fit over the views, or why there is none."""
@@ -210,17 +214,17 @@ class Track:
     ) -> Situation | None:
         """What advice on motion can be based on; None while the points or the edges are not known at all."""
         assert self._references is not None
+        assert self._reference is not None
         assert all_views.views.lens_rotations is not None
         if isinstance(section, str) or not np.isfinite(all_views.fit.points).all():
             return None
-        reference = self._references.of(present)
-        angular_error, translation_error = self._error_bounds(reference, present)
+        angular_error, translation_error = self._error_bounds(self._reference, present)
         return Situation(
             stamp_ns=present.stamp_ns,
             frame_id=edges.frame_id,
             track_id=self.track_id,
             first_lens=self._references.first.lens,
-            reference_lens=reference.lens,
+            reference_lens=self._reference.lens,
             lens=present.lens,
             rotation=all_views.views.lens_rotations[-1],
             points=all_views.fit.points,
@@ -256,7 +260,9 @@ class Track:
             return self._bounded[1]
         angle = max(reference.angular_error, present.angular_error)
         position = max(reference.translation_error, present.translation_error)
-        shared = self._admitted.bounds(reference, present, self._parameters.tracker_bound)
+        assert self._references is not None
+        begin_ns = self._references.first.stamp_ns
+        shared = self._admitted.bounds(reference, present, self._parameters.tracker_bound, begin_ns)
         self._bounded = present, (angle + shared[0], position + shared[1])
         return self._bounded[1]
 
@@ -359,8 +365,8 @@ class Track:
 
     def _admitted_ranges(self, present: PosedView, opening: Opening) -> tuple[Array, Array]:
         """Distances (m, 2) [m] of the points that the errors of two views, one the present, allow."""
-        assert self._references is not None
-        reference = self._references.of(present)
+        assert self._reference is not None
+        reference = self._reference
         angular_error, translation_error = self._error_bounds(reference, present)
         return admitted_ranges(
             reference.lens - present.lens,

@@ -6,6 +6,10 @@ import numpy as np
 
 from knee_gap_uncertainty.scope_calibration.posed_view import PosedView
 
+# Least cosine of the angle, seen from the farthest view, between the first and the present lens: what a track
+# knows of creep it knows along its travel.
+LEAST_COSINE = 0.9
+
 
 @dataclass
 class ReferenceViews:
@@ -23,12 +27,19 @@ class ReferenceViews:
             self.farthest = view
 
     def of(self, present: PosedView) -> PosedView:
-        """The one of both whose lens is farther from the present lens."""
-        if self.farthest is None or between(present, self.first) >= between(present, self.farthest):
+        """The first view, or the farthest if the present lens is farther from that for its errors."""
+        farthest = self.farthest
+        if farthest is None or _merit(self.first, present) >= _merit(farthest, present):
             return self.first
-        return self.farthest
+        there, here = self.first.lens - farthest.lens, present.lens - farthest.lens
+        along = float(there @ here) / max(float(np.linalg.norm(there) * np.linalg.norm(here)), 1e-12)
+        return farthest if along >= LEAST_COSINE else self.first
 
 
 def between(one: PosedView, other: PosedView) -> float:
     """Distance of the lens between two views [m]."""
     return float(np.linalg.norm(one.lens - other.lens))
+
+
+def _merit(view: PosedView, present: PosedView) -> float:
+    return between(view, present) / max(view.angular_error, present.angular_error)

@@ -138,10 +138,13 @@ class CalibrationError:
         moved = shift @ self.root(shift.shape[1])
         return widened(fit, moved @ moved.T)
 
-    def bounds(self, first: PosedView, present: PosedView, factor: float) -> tuple[float, float]:
+    def bounds(
+        self, first: PosedView, present: PosedView, factor: float, begin_ns: int | None = None
+    ) -> tuple[float, float]:
         """What the shared error adds to the bounds of an angle [rad] and of a lens position [m], two views.
 
-        `factor` times the RMS length. Half of a difference between the positions counts at either view.
+        `factor` times the RMS length. Half of a difference between the positions counts at either view. Creep
+        has begun at `begin_ns`, or at the first of the two views.
         """
         shift, turn = self.covariance[:3, :3], self.covariance[3:, 3:]
         felt = (present.view.calibrated_rotations[0] - first.view.calibrated_rotations[0]) / 2.0
@@ -149,9 +152,13 @@ class CalibrationError:
         late = (motions[1][:3] - motions[0][:3]) / 2.0 * self.clock
         turned = max(float(motion[3:] @ motion[3:]) for motion in motions) * self.clock**2
         seen = max(_largest_displacement(view.view) for view in (first, present))
-        seconds = 1e-9 * (present.stamp_ns - first.stamp_ns)
-        angle = np.sqrt(np.trace(turn) + turned + seen**2 + (self.angular_drift * seconds) ** 2)
-        crept = self.drift * seconds / 2.0
+        begin = first.stamp_ns if begin_ns is None else begin_ns
+        seconds = [1e-9 * (view.stamp_ns - begin) for view in (first, present)]
+        angle = np.sqrt(np.trace(turn) + turned + seen**2 + (self.angular_drift * max(seconds)) ** 2)
+        # The lens creeps on its body, which turns: what is felt is the difference in the world.
+        at_first, at_present = (view.view.calibrated_rotations[0] for view in (first, present))
+        apart = seconds[1] * at_present - seconds[0] * at_first
+        crept = self.drift * float(np.linalg.norm(apart, 2)) / 2.0
         scaled = self.scale * (present.lens - first.lens) / 2.0
         position = np.sqrt(np.trace(felt @ shift @ felt.T) + late @ late + crept**2 + scaled @ scaled)
         return factor * float(angle), factor * float(position)
