@@ -76,7 +76,8 @@ class TopicCheck:
     @property
     def usual_times(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Recording times and stamps of the messages that are stamped by the clock of most."""
-        return np.asarray(self.record_ns, dtype=np.int64)[self.usual], self.times_ns[self.usual]
+        usual = self.usual
+        return np.asarray(self.record_ns, dtype=np.int64)[usual], self.times_ns[usual]
 
     def _latency(self) -> Iterator[str]:
         if not self.stamp_ns:

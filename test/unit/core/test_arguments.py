@@ -21,6 +21,10 @@ def test_options_may_stand_between_positional_arguments(line: str) -> None:
     assert (given.out, given.force, given.topics) == ("OUT", True, ["/a", "/b"])
 
 
+def test_a_name_may_begin_with_a_dash_after_two() -> None:
+    assert parser().parse(["--force", "--", "-bag"]).out == "-bag"
+
+
 @pytest.mark.parametrize("line", ["", "OUT --no-such /a"])
 def test_a_mistake_is_one_line_and_exit_code_2(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:

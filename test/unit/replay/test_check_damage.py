@@ -105,6 +105,19 @@ def test_latency_in_a_replay_is_by_the_clock_of_the_replay(
     assert "2 stamped by another clock" in lines["/answer"]
 
 
+def test_two_messages_of_two_clocks_are_no_obstacle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/answer", POSE)
+        for stamp_ns in (3 * YEAR_NS, 16 * MS):
+            message = blank(POSE)
+            set_stamp(message.header, stamp_ns)
+            bag.write("/answer", message, 3 * YEAR_NS + MS)
+    check.main([str(tmp_path / "bag")])
+    assert "1 stamped by another clock" in capsys.readouterr().out
+
+
 def test_images_that_cannot_be_read_are_not_usable(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -15,10 +16,13 @@ class Parser(argparse.ArgumentParser):
 
     def parse(self, argv: Sequence[str] | None = None) -> argparse.Namespace:
         """The arguments; options may stand between several positional ones (OUT --force TOPIC TOPIC)."""
+        given = sys.argv[1:] if argv is None else argv
+        if "--" in given:  # before a name that begins with a dash
+            return self.parse_args(given)
         try:
-            return self.parse_intermixed_args(argv)
+            return self.parse_intermixed_args(given)
         except TypeError:  # not for a parser of subcommands
-            return self.parse_args(argv)
+            return self.parse_args(given)
 
 
 def positive(text: str) -> float:

@@ -250,7 +250,6 @@ class GapEstimator:
             self.counts["clock ran backwards"] += 1
             self._pending.clear()
             self._delays.clear()
-            self._pose_silence.restart(now_ns)
             if self._last_edges is not None:
                 self._last_edges = self._last_edges._replace(arrival_ns=now_ns)
                 self._silence.restart(now_ns)
@@ -291,9 +290,10 @@ class GapEstimator:
 
     def _longest_wait_ns(self, pending: Pending, now_ns: int) -> float:
         """How long edges may wait for their pose [ns]: poses that do not come any more are not awaited."""
+        longest = self.parameters.max_pose_wait * NANOSECONDS
         if self._pose_silence.is_due(now_ns):
-            return QUEUES_NS if pending.queued else -1.0
-        return self.parameters.max_pose_wait * NANOSECONDS
+            return min(QUEUES_NS, longest) if pending.queued else -1.0
+        return longest
 
     def _rotation_is_followed(self) -> bool:
         """Whether the rotation of the scope in its camera head is reported, or announced."""

@@ -76,8 +76,9 @@ class Track:
         self.frame_id = frame_id
         self._parameters = parameters
         self._references: ReferenceViews | None = None
-        self._reference: PosedView | None = None  # of the present view
-        self._bounded: tuple[PosedView, tuple[float, float]] | None = None  # error bounds of the last view
+        # Of the present view: with which its bounds are made, and the bounds of the errors of both.
+        self._reference: PosedView | None = None
+        self._errors = np.inf, np.inf
         self._segment = 0
         self._window = ViewWindow()
         self._recent: deque[PosedView] = deque()
@@ -132,7 +133,7 @@ class Track:
         # The rate of creep is known along the way from the first view.
         if reference is first:
             self._admit_creep()
-        self._bounded = None
+        self._errors = self._error_bounds(first, reference, view)
         self._passing = None if self._window.add(view.view) else view.view
         blank = replace(blank, view_count=len(self._window))
         if fitted is None:
@@ -218,7 +219,7 @@ class Track:
         assert all_views.views.lens_rotations is not None
         if isinstance(section, str) or not np.isfinite(all_views.fit.points).all():
             return None
-        angular_error, translation_error = self._error_bounds(self._reference, present)
+        angular_error, translation_error = self._errors
         return Situation(
             stamp_ns=present.stamp_ns,
             frame_id=edges.frame_id,
@@ -243,7 +244,7 @@ class Track:
 
     def _bounds(self, reference: PosedView, present: PosedView) -> tuple[GapRange, float]:
         """Bounds from another and the present view, and the smaller parallax of the two points [rad]."""
-        angular_error, translation_error = self._error_bounds(reference, present)
+        angular_error, translation_error = self._errors
         bounds, points = gap_range_and_points(
             (reference.lens, present.lens),
             (reference.bearings, present.bearings),
@@ -254,17 +255,14 @@ class Track:
         )
         return bounds, float(np.min(points.gamma))
 
-    def _error_bounds(self, reference: PosedView, present: PosedView) -> tuple[float, float]:
+    def _error_bounds(
+        self, first: PosedView, reference: PosedView, present: PosedView
+    ) -> tuple[float, float]:
         """Bounds of a bearing's [rad] and of a lens position's error [m], the calibration's included."""
-        if self._bounded is not None and self._bounded[0] is present:
-            return self._bounded[1]
         angle = max(reference.angular_error, present.angular_error)
         position = max(reference.translation_error, present.translation_error)
-        assert self._references is not None
-        begin_ns = self._references.first.stamp_ns
-        shared = self._admitted.bounds(reference, present, self._parameters.tracker_bound, begin_ns)
-        self._bounded = present, (angle + shared[0], position + shared[1])
-        return self._bounded[1]
+        shared = self._admitted.bounds(reference, present, self._parameters.tracker_bound, first.stamp_ns)
+        return angle + shared[0], position + shared[1]
 
     def _measured(
         self,
@@ -367,7 +365,7 @@ class Track:
         """Distances (m, 2) [m] of the points that the errors of two views, one the present, allow."""
         assert self._reference is not None
         reference = self._reference
-        angular_error, translation_error = self._error_bounds(reference, present)
+        angular_error, translation_error = self._errors
         return admitted_ranges(
             reference.lens - present.lens,
             present.bearings,
